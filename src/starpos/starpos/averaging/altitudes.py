@@ -27,7 +27,7 @@ from starpos.frozen import at_once
 from starpos.sky.bodies import MOON, SUN
 from starpos.units import ARCSEC, SIGMA_PER_MAD
 
-# with a worse A3 the circles are no longer what a linear error makes of them
+# with a worse A3 the circles are no longer what a linear error makes of them: its axis is fitted first
 LINEAR_A3_RAD = 360 * ARCSEC
 # maximum distance of frames that look in one direction, in rad and in sigma
 SAME_RAD, SAME_SIGMA = 60 * ARCSEC, 6.0
@@ -41,8 +41,8 @@ ROUNDS, SETTLED = 30, 1e-12
 ALIKE = 1e-7
 # an answer is excluded if its fit is worse by this
 EXCLUDED_SIGMA = 6.0
-# outliers: their distance, minimum number of directions, number of rounds
-OUTLIER_SIGMA, MIN_JUDGED, JUDGED = 6.0, 6, 6
+# outliers: their distance, minimum number of directions, maximum share left out where A3 is fitted too, number of rounds
+OUTLIER_SIGMA, MIN_JUDGED, MAX_OUTLIERS, JUDGED = 6.0, 6, 1 / 3, 6
 WITHIN = 0.95
 # 1 sigma of --near where it chooses between the Sun and the Moon
 NEAR_RAD = 500 / 6371
@@ -55,16 +55,10 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
 
     near: latitude, longitude (rad) that selects one of two places, where the circles meet in two.
     `poses` is the number of directions, `left_out` the frames of those that disagree.
-    Raises FixError if there are fewer than three directions, or two without `near`, if they leave two places, or if A3 is
-    known too badly for its error to be linear.
+    Raises FixError if there are fewer than three directions, or two without `near`, or if they leave two places.
     """
     whole = Directions.of(sorted(circles, key=lambda c: c.utc_unix_s))
     number = len(whole.covariance)
-    if whole.wide:
-        raise FixError(
-            "elevations determine a place only where A3 is known to 6 arcmin: find it by night with starpos calibrate "
-            "--site"
-        )
     if number < 2 or (number == 2 and near is None):
         raise FixError(
             f"{len(circles)} elevations in {number} {'direction' if number == 1 else 'directions'} do not "
@@ -138,6 +132,11 @@ class Directions:
     def covariance(self) -> np.ndarray:
         return np.sum(list(self.sources.values()), axis=0)
 
+    @staticmethod
+    def east_north(zenith: np.ndarray) -> np.ndarray:
+        """East and north (2, 3) in ITRS at a zenith (3,), along which the derivatives of `residual` are."""
+        return _enu(zenith)[:2]
+
     @property
     def wide(self) -> bool:
         """Whether A3 is known too badly for a linear error."""
@@ -155,13 +154,16 @@ class Directions:
         starts = np.cumsum([0, *number[:-1]])
         return (np.add.reduceat(values, starts).T / number).T
 
-    def residual(self, zenith: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def residual(
+        self, zenith: np.ndarray, measured: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Mean zenith distances minus those measured (D,) at a zenith (3,), and their derivatives (D, 2).
 
-        They are by the zenith's steps east and north, in rad.
+        They are by the zenith's steps east and north, in rad.  measured (N,): in place of the circles' own.
         """
         every = [c for g in self.circles for c in g]
-        measured = np.array([c.zenith_distance for c in every])
+        if measured is None:
+            measured = np.array([c.zenith_distance for c in every])
         nearer = np.array([c.parallax for c in every])[:, None] * ground_m(zenith) / EQUATOR_RADIUS_M
         v = rotation.normalised(np.array([c.itrs for c in every]) - nearer + station_velocity(zenith))
         axes = _enu(zenith)
@@ -245,13 +247,13 @@ def _sound(whole: Directions) -> np.ndarray:
     def size(zenith: np.ndarray) -> np.ndarray:
         return np.abs(whole.residual(zenith)[0]) / sigma
 
-    zenith = min(_starts(whole), key=lambda start: float(np.median(size(start))), default=None)
+    zenith = min(starts(whole), key=lambda start: float(np.median(size(start))), default=None)
     rows: np.ndarray = every
     for _ in range(JUDGED):
         if zenith is None:
             return every
         off = size(zenith)
-        agree = np.flatnonzero(off < OUTLIER_SIGMA * max(_usual_sigma(off, number - 2), 1.0))
+        agree = np.flatnonzero(off < OUTLIER_SIGMA * max(usual_sigma(off, number - 2), 1.0))
         if len(agree) <= number // 2:
             return every
         if np.array_equal(agree, rows):
@@ -262,7 +264,7 @@ def _sound(whole: Directions) -> np.ndarray:
     return rows
 
 
-def _usual_sigma(off: np.ndarray, free: int) -> float:
+def usual_sigma(off: np.ndarray, free: int) -> float:
     """Sigma by the median of residuals, of which a fit that is robust leaves as many as `free` other than 0."""
     return SIGMA_PER_MAD * (1 + 5 / free) * float(np.median(np.sort(off)[-free:]))
 
@@ -271,7 +273,7 @@ def _answer(part: Directions, near: tuple[float, float] | None) -> _Answer:
     """The one place that fits; FixError if no place fits, or two do."""
     weight = np.linalg.inv(part.covariance)
     found: list[_Answer] = []
-    for start in _starts(part):
+    for start in starts(part):
         one = _refined(part, weight, start)
         if one is None or any(c.itrs @ one.zenith < 0 for g in part.circles for c in g):
             continue
@@ -299,7 +301,7 @@ def _answer(part: Directions, near: tuple[float, float] | None) -> _Answer:
     return left[0]
 
 
-def _starts(part: Directions) -> list[np.ndarray]:
+def starts(part: Directions) -> list[np.ndarray]:
     """Zeniths (3,) in which two circles meet, or where they are nearest to each other."""
     some = np.unique(np.linspace(0, len(part.circles) - 1, STARTS).astype(int))
     firsts = [part.circles[k][0] for k in some]
@@ -354,7 +356,7 @@ def _average(part: Directions, answer: _Answer, frames: int) -> Average:
             f"the elevations of three directions contradict each other by {np.sqrt(answer.chi2):.0f} sigma: "
             f"one is wrong, or their errors are larger than stated: add directions, or state larger errors"
         )
-    beyond = _excess(answer.chi2, free)
+    beyond = excess(answer.chi2, free)
     terms.append(term(SCATTER, beyond * metres @ part.covariance @ metres.T))
     times = [c.utc_unix_s for c in every]
     return Average(
@@ -376,7 +378,7 @@ def f_quantile(free: int, share: float) -> float:
     return free / 2 * float((1 - share) ** (-2 / free) - 1)
 
 
-def _excess(chi2: float, free: int) -> float:
+def excess(chi2: float, free: int) -> float:
     """Variance beyond the stated one, as a share of it, for residuals that scatter more than stated.
 
     A few of them determine it poorly; Student's t allows for this. A single one counts as two.

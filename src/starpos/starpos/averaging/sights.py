@@ -174,6 +174,8 @@ def circle_of_sight(
         utc_unix_s=sight.utc_unix_s,
         itrs=itrs,
         ray=np.array([0.0, 0.0, 1.0]),
+        up=np.array([0.0, 0.0, 1.0]),
+        axes=2,
         zenith_distance=math.pi / 2 - altitude - sight.limb * radius,
         sigma=sigma * half,
         terms=tuple(ErrorTerm(name, np.array([[e]]), shared=ALWAYS) for name, e in errors.items()),

@@ -42,7 +42,8 @@ from starpos.instrument.tilt_log import TiltLog
 from starpos.night import horizon
 from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
-from starpos.night.remarks import of_inclinometer
+from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_inclinometer, of_left_out
+from starpos.night.together import axis_of, circles_of
 from starpos.night.watching import Answer, kept, night_poses, sky_mag
 from starpos.night.work import Solving
 from starpos.sky import catalogue
@@ -117,6 +118,34 @@ def run_site(
     _save(args, found, about)
 
 
+def run_elevations(
+    args: argparse.Namespace, pointings: Sequence[Pointing], instrument: Instrument, tilts: TiltLog
+) -> None:
+    """Find A3's axis from pointings without a roll, write and print it; raises FixError if they do not determine it."""
+    solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
+    for row in circles_of(solver, pointings, tilts):
+        if isinstance(row, StarposError):
+            console.complain(f"left out: {row}")
+    site = _site(args)
+    found = axis_of(solver, pointings, tilts, site=site)
+    console.complain(*of_left_out(found.left_out), *of_inclinometer(instrument))
+    scatter = np.sqrt(1 + found.scatter2)
+    if scatter > SCATTERED and found.stddev_arcsec > WORTH_SAVING_ARCSEC:
+        raise FixError(
+            f"A3 is not written: the elevations scatter by {scatter:.0f} times their stated errors, and determine it to "
+            f"{found.stddev_arcsec:.0f} arcsec only: check the place, the clock, and the tilts' axes, signs and units"
+        )
+    calibration = found.calibration(instrument.calibration, options.turn_of(args))
+    about = (
+        f"A3 of {calibration.frames} elevations in {found.directions} directions at {_text_of(site)} "
+        "(by gravity): "
+        "{:.5f} {:.5f} {:.5f} deg\n".format(*calibration.misalignment_deg)
+        + f"the frame's centre in the inclinometer is known to {found.stddev_arcsec:.2f} arcsec; elevations "
+        f"alone do not determine the turn about it, which does not matter for pointings without a roll\n"
+    )
+    _save(args, Calibrated(replace(instrument, calibration=calibration), found.stddev_arcsec, ()), about)
+
+
 def _save(args: argparse.Namespace, found: Calibrated, about: str) -> None:
     """Write what was found as -o and --valid-days ask, and print it."""
     instrument = found.instrument
@@ -180,6 +209,8 @@ def _json_of_site(found: Calibrated, path: str) -> dict:
 
 # Exit status.
 NOTHING = 1
+# elevations that scatter by more, in stated sigmas, contradict what is stated with them
+SCATTERED = 3.0
 # the stars of a frame, and their identification
 _Seen = tuple[Stars, Identification | None]
 
@@ -312,16 +343,20 @@ def _tilts(args: argparse.Namespace, instrument: Instrument) -> TiltLog | None:
 
 
 def _from_pointings(args: argparse.Namespace) -> int:
-    """Calibrate from the pointings of a plate solver; returns the exit status."""
+    """Calibrate from the pointings of a plate solver, or from elevations if none has a roll; returns the exit status."""
     pointings = read_pointings(args.pointings)
     whole = [p for p in pointings if p.has_roll]
-    if len(whole) < len(pointings):
+    elevations = pointings if not whole and args.tilt is not None else []
+    if len(whole) < len(pointings) and not elevations:
         console.complain(f"{len(pointings) - len(whole)} pointings without a roll are left out")
     instrument = options.instrument_of(args, NO_CAMERA)
     check_output(args, instrument)
     tilts = _tilts(args, instrument)
     try:
-        run_site(args, whole, instrument, tilts)
+        if elevations and tilts is not None:
+            run_elevations(args, elevations, instrument, tilts)
+        else:
+            run_site(args, whole, instrument, tilts)
     except FixError as e:
         console.complain(e)
         return NOTHING

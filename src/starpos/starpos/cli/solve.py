@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from starpos.averaging.elevation_axis import FoundAxis
 from starpos.cli import console, fix_output, inputs, options, overwriting, places_file, sights
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
@@ -28,7 +29,7 @@ from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night import field
 from starpos.night.opening import work_of
 from starpos.night.reading import NO_CAMERA, About, First, Instruments
-from starpos.night.remarks import Near, of_inclinometer
+from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, of_inclinometer
 from starpos.night.solving import How, NightAnswers, answers_of
 from starpos.night.together import (
     FrameAnswer,
@@ -196,10 +197,6 @@ def run_pointings(args: argparse.Namespace) -> int:
         args, fix_output.COLUMNS, fix_output.HEAD if whole else fix_output.ELEVATIONS_HEAD
     )
     if not whole:
-        if args.self_calibrate:
-            raise InstrumentError(
-                "--self-calibrate takes pointings with a roll: elevations alone do not determine A3"
-            )
         return _from_elevations(args, output, solver, tilts, pointings, vertical, near)
     found, given = None, solver.instrument if not args.self_calibrate else None
     solutions: Iterable[Solution] = (solver.solve_pointing(p, tilts) for p in pointings)
@@ -221,7 +218,7 @@ def _from_elevations(
     near: Near | None,
 ) -> int:
     """Print each row's zenith distance and the place that they give together; returns the exit status."""
-    found = from_elevations(solver, pointings, tilts, near)
+    found = from_elevations(solver, pointings, tilts, near, args.self_calibrate)
     for p, circle in zip(pointings, found.circles, strict=True):
         if isinstance(circle, StarposError):
             console.complain(circle)
@@ -229,7 +226,14 @@ def _from_elevations(
             fix_output.put_elevation(output, p.source, p.mid_unix_s, None, vertical, status)
         else:
             fix_output.put_elevation(output, p.source, p.mid_unix_s, circle.zenith_distance, vertical)
-    whole = found.together
+    whole, saving = found.together, 0
+    if found.axis is not None:
+        say(
+            None,
+            f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec",
+        )
+    if args.save is not None:
+        saving = _save_axis(args, solver, found.axis)
     say(None, *([whole.why_not] if whole.why_not else ()), *whole.remarks)
     place, about = whole.average, {}
     if place is not None:
@@ -237,7 +241,18 @@ def _from_elevations(
         about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
     if place is not None or whole.why_not:
         fix_output.put_combined(output, None, place, Gathered(), vertical, about)
-    return 0 if place else console.NOTHING
+    return max(saving, 0 if place else console.NOTHING)
+
+
+def _save_axis(args: argparse.Namespace, solver: Solver, axis: FoundAxis | None) -> int:
+    """Write the A3 that the elevations determined, as --save asks; console.NOTHING if they did not."""
+    if axis is None or axis.stddev_arcsec > WORTH_SAVING_ARCSEC:
+        console.complain(f"{args.save} is not written: the elevations hardly determine A3")
+        return console.NOTHING
+    calibration = axis.calibration(solver.instrument.calibration, options.turn_of(args))
+    about = f"A3 of elevations alone: the frame's centre to {axis.stddev_arcsec:.2f} arcsec"
+    overwriting.save_instrument(args.save, replace(solver.instrument, calibration=calibration), about)
+    return 0
 
 
 def run(args: argparse.Namespace) -> int:

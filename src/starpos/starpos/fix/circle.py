@@ -31,11 +31,14 @@ class Circle:
     sigma (rad): of the direction, across the circle.  terms: errors of the zenith distance, with factors (1, m) in rad.
     clock_stddev_s, stamp_stddev_s: as in a fix.
     instead: the same disc as the Moon's, which it may be as well; None where it cannot be.
+    up (3,): in S, as the inclinometer shows it; axes: their number, 2 or 3.
     """
 
     utc_unix_s: float
     itrs: np.ndarray
     ray: np.ndarray
+    up: np.ndarray
+    axes: int
     zenith_distance: float
     sigma: float
     terms: tuple[ErrorTerm, ...]
@@ -78,6 +81,8 @@ def circle_along(
         utc_unix_s=earth.utc_unix_s,
         itrs=itrs,
         ray=ray,
+        up=level.up,
+        axes=tilt.axes,
         zenith_distance=z,
         terms=(*terms, ErrorTerm("refraction", np.array([[bent]]), shared=ALWAYS)),
         earth=earth,

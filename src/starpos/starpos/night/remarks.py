@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.averaging.average import SCATTER, Average
+from starpos.averaging.elevation_axis import FoundAxis
 from starpos.calibration.misalignment import Calibrated
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
@@ -16,7 +17,6 @@ from starpos.fix.budget import local_north
 from starpos.fix.fix import Fix, length_text
 from starpos.fix.solution import Solution
 from starpos.fix.terms import Origin, total_covariance
-from starpos.frames.gravity import PHONE
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt, level_of, up_of
 from starpos.instrument.instrument import Calibration, Instrument
@@ -56,8 +56,11 @@ def of_gravity(instrument: Instrument, by_log: bool = False) -> tuple[Remark, ..
     """Say what a place by photographs rests on; instrument: with their level.  by_log: a telephone's log is it."""
     if not instrument.has_level_inside:
         return ()
-    level = "felt by the telephone" if instrument.inclinometer_model == PHONE else "by the camera's level"
-    where = "the telephone's log, as the camera's own" if by_log else f"the gravity in the files, {level}"
+    where = (
+        "the telephone's log, as the camera's own"
+        if by_log
+        else "the gravity in the files, felt by the telephone"
+    )
     sentence = f"the level is {where}; time, zone and lens are the files', and their GPS is only compared"
     return (Remark(sentence),)
 
@@ -141,27 +144,37 @@ def of_average(whole: Average, solved: Sequence[Solution] = ()) -> Iterator[Rema
         )
 
 
-# a claim that scatter widens by more is worth a word
-WIDENED = 1.4
+def beyond_stated(place: Average | None) -> bool:
+    """Whether the residuals of elevations are beyond their stated errors; they are if no place fits."""
+    if place is None:
+        return True
+    shares = [np.trace(t.covariance[:2, :2]) for t in place.terms if t.name == SCATTER]
+    return place.left_out > 0 or sum(shares) > np.trace(place.covariance[:2, :2]) / 2
 
 
-def scatter_of(place: Average) -> float:
-    """Factor by which the residuals widen the claimed error of a place."""
-    whole = np.trace(place.covariance[:2, :2])
-    beyond = sum(np.trace(t.covariance[:2, :2]) for t in place.terms if t.name == SCATTER)
-    return float(np.sqrt(whole / (whole - beyond)))
+def of_left_out(elevations: int) -> Iterator[Remark]:
+    """Say that some elevations are not used."""
+    if elevations:
+        yield Remark(
+            f"{elevations} elevations contradict the others and are left out: their tilts or pointings are wrong"
+        )
 
 
 def of_elevations(place: Average) -> Iterator[Remark]:
     """Say which elevations the place is not from, and that the others scatter."""
-    if place.left_out:
-        yield Remark(
-            f"{place.left_out} elevations contradict the others and are left out: their tilts or pointings are wrong"
-        )
-    if scatter_of(place) > WIDENED:
+    yield from of_left_out(place.left_out)
+    if beyond_stated(replace(place, left_out=0)):
         yield Remark(
             "the elevations scatter by more than the stated errors of tilts and A3: the claimed error includes it"
         )
+
+
+def of_denied_a3(axis: FoundAxis, given: Calibration) -> Remark:
+    """Say that the elevations deny the A3 that was given."""
+    return Remark(
+        f"the elevations deny the A3 given, by {axis.sigma_from(given):.0f} sigma: the place is from the A3 that they "
+        "determine: calibrate again"
+    )
 
 
 def of_a3(

@@ -5,13 +5,16 @@ doubts.
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.averaging.altitudes import place_of_circles, place_of_discs
+from starpos.averaging.altitudes import MIN_JUDGED, Directions, place_of_circles, place_of_discs
 from starpos.averaging.average import Average, average
+from starpos.averaging.elevation_axis import MIN_WITHOUT_SITE, FoundAxis, find_axis
 from starpos.calibration.misalignment import Calibrated, turn
+from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, FrameError, GnssError, StarposError
 from starpos.fix.circle import Circle, circle_of
@@ -25,13 +28,13 @@ from starpos.gnss.receiver import GnssTrack
 from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssWatch
-from starpos.instrument.instrument import Instrument
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
 from starpos.night.remarks import Near, Remark, doubts, of_inclinometer
 
-# elevations that scatter by more, in stated sigmas, contradict what is stated with them
-SCATTERED = 3.0
+# elevations that have A3's axis further from where it was given, in sigma of both, deny the given one
+DENIED_SIGMA = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +141,11 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
 def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
     """The place by the circles of the Sun, or of the Moon."""
     try:
+        if Directions.of(sorted(circles, key=lambda c: c.utc_unix_s)).wide:
+            raise FixError(
+                "the Sun's elevations determine a place only where A3 is known to 6 arcmin: find it by night with "
+                "starpos calibrate --site"
+            )
         place, _ = place_of_discs(circles, None if near is None else (near.latitude, near.longitude))
     except FixError as error:
         return Together(None, str(error))
@@ -189,27 +197,44 @@ def turned(
 
 @dataclass(frozen=True)
 class Elevations:
-    """Each pointing's circle on which its place lies, or the error; the place of all."""
+    """Each pointing's circle on which its place lies, or the error; the place of all.
+
+    axis: A3 whose axis the elevations determined too; None if A3 was known well enough or they do not determine it.
+    """
 
     circles: tuple[Circle | StarposError, ...]
     together: Together
+    axis: FoundAxis | None = None
 
 
 def from_elevations(
-    solver: Solver, pointings: Sequence[Pointing], tilts: Tilts, near: Near | None = None
+    solver: Solver,
+    pointings: Sequence[Pointing],
+    tilts: Tilts,
+    near: Near | None = None,
+    self_calibrate: bool = False,
 ) -> Elevations:
-    """Find the place of pointings.  near: selects between two places that the elevations leave."""
+    """Find the place of pointings, and A3's axis where it is not known to a few arcmin.
+
+    near: selects between two places that the elevations leave. self_calibrate: treat A3 as unknown.
+    """
+    if self_calibrate:
+        unknown = Calibration.of(solver.instrument.calibration.misalignment_deg)
+        solver = replace(solver, instrument=replace(solver.instrument, calibration=unknown))
     circles = circles_of(solver, pointings, tilts)
     sound = [c for c in circles if isinstance(c, Circle)]
     if not sound:
         return Elevations(tuple(circles), Together())
+    there, axis = None if near is None else (near.latitude, near.longitude), None
     try:
-        place = place_of_circles(sound, None if near is None else (near.latitude, near.longitude))
-        if (scatter := remarks.scatter_of(place)) > SCATTERED:
-            raise FixError(
-                f"the elevations scatter by {scatter:.0f} times their stated errors: check A3, and the tilts' axes, "
-                "signs and units"
-            )
+        directions = Directions.of(sorted(sound, key=lambda c: c.utc_unix_s))
+        if self_calibrate or (directions.wide and len(directions.circles) >= MIN_WITHOUT_SITE):
+            axis = axis_of(solver, pointings, tilts, there)
+            # A3's error is counted from the given A3, or from the one found if none was given
+            sound = axis.about(axis.a3 if self_calibrate else solver.instrument.calibration.a3)
+        place = place_of_circles(sound, there)
+        if axis is not None:
+            place = replace(place, left_out=place.left_out + axis.left_out)
         said = (
             *remarks.of_elevations(place),
             *of_inclinometer(solver.instrument),
@@ -218,7 +243,46 @@ def from_elevations(
         together = Together(place, "", said)
     except FixError as error:
         together = Together(None, str(error))
-    return Elevations(tuple(circles), together)
+    found = Elevations(tuple(circles), together, axis)
+    if self_calibrate or axis is not None or not remarks.beyond_stated(together.average):
+        return found
+    # residuals beyond the stated errors may come from a wrong A3, which no scatter covers
+    given = solver.instrument.calibration
+    free = from_elevations(solver, pointings, tilts, near, self_calibrate=True)
+    if free.axis is None or free.axis.directions < MIN_JUDGED or free.axis.sigma_from(given) < DENIED_SIGMA:
+        return found
+    said = (remarks.of_denied_a3(free.axis, given), *free.together.remarks)
+    return replace(free, circles=tuple(circles), together=replace(free.together, remarks=said))
+
+
+def axis_of(
+    solver: Solver,
+    pointings: Sequence[Pointing],
+    tilts: Tilts,
+    near: tuple[float, float] | None = None,
+    site: Place | None = None,
+) -> FoundAxis:
+    """A3's axis from pointings at a site, or at an unknown place; FixError if they do not determine it."""
+
+    levelled = []
+    for pointing in pointings:
+        # `circles_of` reports why a pointing has no circle
+        with suppress(StarposError):
+            levelled.append((pointing, *solver.levelled(pointing, tilts)))
+
+    camera = solver.instrument.camera or IDEAL
+
+    def with_a3(a3: np.ndarray) -> list[Circle]:
+        mounting = replace(solver.instrument.mounting, a3=a3)
+        circles = []
+        for pointing, state, tilt in levelled:
+            about = replace(solver.circumstances(pointing, camera, state), mounting=mounting)
+            with suppress(FixError):
+                circles.append(circle_of(pointing, tilt, about))
+        return circles
+
+    given = solver.instrument.calibration
+    return find_axis(with_a3, given, camera.centre_ray, site, near)
 
 
 def circles_of(solver: Solver, pointings: Sequence[Pointing], tilts: Tilts) -> list[Circle | StarposError]:

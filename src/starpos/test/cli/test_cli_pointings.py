@@ -183,28 +183,43 @@ def test_one_direction_is_no_place(tables, capsys):
 
 
 @pytest.mark.parametrize(
-    ("a3", "words"),
-    [
-        (("--misalignment", "3.5", "-4", "130", "--misalignment-stddev", "9000"), "only where A3 is known"),
-        ((), "only where A3 is known"),
-        (("--misalignment", "3.5", "-4", "130", "--misalignment-stddev", "60"), "scatter by"),
-    ],
-    ids=["known to 2.5 deg", "not known", "wrong"],
+    "a3",
+    [("--misalignment", "3.5", "-4", "130", "--misalignment-stddev", "9000"), (), ("--self-calibrate",)],
+    ids=["known to 2.5 deg", "not known", "found"],
 )
-def test_elevations_without_a_good_a3_are_no_place(a3, words, tables, capsys):
+def test_elevations_of_many_directions_determine_a3_too(a3, tables, capsys):
     status, out, errors = run(
         capsys, "solve", *tables.pointings("bare.csv"), *tables.tilt, *AIR, *SENSOR, *a3, "--json"
     )
-    assert status == 1 and objects(out)[-1]["latitude"] is None and words in errors[0]
+    together = objects(out)[-1]
+    assert status == 0 and any("A3 from the elevations" in line for line in errors)
+    assert tables.sigmas_off(together) < 4 and together["sigma_north_m"] < 1000
 
 
-def test_elevations_determine_no_a3(tables, capsys, tmp_path):
-    bare, site = (*tables.pointings("bare.csv"), *tables.tilt, *AIR, *SENSOR), tables.night.site
-    status, _, errors = run(capsys, "solve", *bare, "--self-calibrate")
-    assert status == 2 and "pointings with a roll" in errors[0]
-    place = ("--site", site.latitude_deg, site.longitude_deg, "-o", tmp_path / "found.yaml")
-    status, _, errors = run(capsys, "calibrate", *bare, *place)
-    assert status == 1 and "16 pointings without a roll are left out" in errors[0]
+def test_two_directions_with_an_a3_known_badly_claim_little(tables, capsys):
+    near = ("--near", tables.night.site.latitude_deg, tables.night.site.longitude_deg)
+    a3 = ("--misalignment", "1.5", "-2", "130", "--misalignment-stddev", "3600")
+    status, out, _ = run(
+        capsys, "solve", *tables.pointings("two.csv"), *tables.tilt, *AIR, *SENSOR, *a3, *near, "--json"
+    )
+    assert status == 0 and objects(out)[-1]["sigma_north_m"] > 10_000
+
+
+def test_elevations_at_a_known_place_calibrate(tables, capsys, tmp_path):
+    """An instrument file without a camera: of pointings none is needed."""
+    site, found = tables.night.site, tmp_path / "found.yaml"
+    given = (
+        "starpos_instrument: 1\ninclinometer: {model: sca100t_calibrated}\nmisalignment_deg: [3.5, -4, 130]\n"
+    )
+    found.write_text(given + "calibration_stddev_arcsec: [9000, 9000, 9000]\n")
+    place = ("--site", site.latitude_deg, site.longitude_deg, "-o", found)
+    bare = (*tables.pointings("bare.csv"), *tables.tilt, *AIR, "--instrument", found)
+    status, out, errors = run(capsys, "calibrate", *bare, *place)
+    assert (status, errors) == (0, []) and "A3 of 16 elevations in 8 directions" in out
+    assert "camera" not in found.read_text()
+    status, out, errors = run(capsys, "solve", *bare, "--json")
+    assert status == 0 and tables.sigmas_off(objects(out)[-1]) < 4
+    assert objects(out)[-1]["sigma_north_m"] < 1000
 
 
 def test_frames_still_need_a_camera(capsys, tmp_path):

@@ -1,0 +1,363 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The camera's axis in the inclinometer from elevations alone, at a known place or together with it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starpos import rotation
+from starpos.averaging.altitudes import (
+    EXCLUDED_SIGMA,
+    MAX_OUTLIERS,
+    MIN_JUDGED,
+    OUTLIER_SIGMA,
+    Directions,
+    excess,
+    starts,
+    usual_sigma,
+)
+from starpos.earth.place import Place
+from starpos.earth.refraction import MIN_COS_ZENITH
+from starpos.errors import FixError
+from starpos.fix.circle import MIN_SINE, Circle
+from starpos.frozen import at_once
+from starpos.instrument.instrument import UNKNOWN_ARCSEC, Calibration
+from starpos.instrument.mounting import angles_at
+from starpos.units import ARCSEC
+
+# rounds of weights that follow the residuals
+REWEIGHTED = 20
+# rounds of refractions and errors that follow A3, until it moves by less (rad)
+RELINEARISED, SAME_AXIS_RAD = 8, 1e-7
+MAX_STEP_RAD = 0.3
+AXIS_ROUNDS, SETTLED_CHI2, FIRST_DAMPING, LAST_DAMPING = 80, 1e-6, 1e-3, 1e9
+# an axis that is known better than this (rad) is known
+MIN_RAD = 1e-9
+# number of zeniths that are tried, the ones that fit best at first
+TRIED = 4
+# minimum number of directions that determine an axis, with the zenith known and unknown
+FEWEST, MIN_WITHOUT_SITE = 2, 4
+# how long A3 may be used
+VALID_DAYS = 365.0
+# the term of the circles that holds A3's error, which is fitted here
+OF_A3 = "calibration"
+
+# the circles of all frames with an A3 (3, 3)
+CirclesOf = Callable[[np.ndarray], Sequence[Circle]]
+
+
+@at_once
+@dataclass(frozen=True, kw_only=True)
+class FoundAxis:
+    """A3 whose axis the elevations determined.
+
+    a3 (3, 3).  ray (3,): the frame's centre in C.  zenith (3,) in ITRS.
+    covariance (2, 2) in rad2: of the axis along `across` (2, 3) in S, with the scatter of the directions.
+    chi2: of the fit; scatter2: variance beyond the stated, as a share of it.
+    directions: their number; off (D,): their residuals in sigma.
+    left_out: number of frames of directions that contradict the others, which are not in `circles`.
+    """
+
+    a3: np.ndarray
+    ray: np.ndarray
+    zenith: np.ndarray
+    across: np.ndarray
+    covariance: np.ndarray
+    scatter2: float
+    directions: int
+    off: np.ndarray
+    chi2: float
+    circles: Sequence[Circle]
+    left_out: int = 0
+
+    def sigma_from(self, given: Calibration) -> float:
+        """Distance of the axis from where a calibration has it, in sigma of both."""
+        off = self.across @ (self.a3 - given.a3) @ self.ray
+        known = _known(given, self.a3 @ self.ray, self.across)
+        return float(np.sqrt(off @ np.linalg.solve(known + self.covariance, off)))
+
+    @property
+    def stddev_arcsec(self) -> float:
+        """Sigma of the axis on the worse of two axes."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]) / ARCSEC)
+
+    def calibration(self, given: Calibration, turn_stddev_deg: float) -> Calibration:
+        """The calibration, whose turn about the axis is as `given`, to turn_stddev_deg."""
+        axis = self.a3 @ self.ray
+        turns = np.cross(axis, self.across)
+        turn = min(np.radians(turn_stddev_deg), UNKNOWN_ARCSEC[2] * ARCSEC)
+        covariance = turns.T @ self.covariance @ turns + turn**2 * np.outer(axis, axis)
+        up = rotation.normalised(np.sum([c.up for c in self.circles], axis=0))
+        return replace(
+            given.turned_to(self.a3),
+            covariance_arcsec2=tuple(map(tuple, (covariance / ARCSEC**2).tolist())),
+            utc_unix_s=float(np.mean([c.utc_unix_s for c in self.circles])),
+            tilt_deg=tuple(np.degrees(angles_at(up, self.circles[0].axes)).tolist()),
+            frames=len(self.circles),
+            valid_days=VALID_DAYS,
+            response=(),
+            response_covariance=(),
+        )
+
+    def about(self, a3: np.ndarray) -> list[Circle]:
+        """The circles with the zenith distances of another A3 (3, 3), as far as they are linear in its error here."""
+        moved = self.across @ a3 @ self.ray
+        return [
+            replace(c, zenith_distance=c.zenith_distance + float(_slope(c, self.across) @ moved))
+            for c in self.circles
+        ]
+
+
+def find_axis(
+    circles_of: CirclesOf,
+    given: Calibration,
+    ray: np.ndarray,
+    site: Place | None = None,
+    near: tuple[float, float] | None = None,
+) -> FoundAxis:
+    """Fit A3's axis, and the zenith unless a site is given; `given` counts as well as it is known.
+
+    ray (3,): the frame's centre in C.  near: latitude, longitude (rad) that selects one of two answers.
+    Raises FixError if the directions are too few, or leave two answers.
+    """
+    first = Directions.of(sorted(circles_of(given.a3), key=lambda c: c.utc_unix_s))
+    number, fewest = len(first.circles), MIN_WITHOUT_SITE if site is None else FEWEST
+    if number < fewest:
+        raise FixError(
+            f"elevations in {number} {'direction' if number == 1 else 'directions'} do not determine A3: without a roll "
+            f"it takes {fewest} or more (frames of a camera that stands still are one)"
+        )
+    found = _axes(circles_of, given, ray, site)
+    wrong = _contradicting(found[0], given, site)
+    if wrong:
+
+        def agreeing(a3: np.ndarray) -> list[Circle]:
+            return [c for c in circles_of(a3) if c.utc_unix_s not in wrong]
+
+        found = [replace(f, left_out=len(wrong)) for f in _axes(agreeing, given, ray, site)]
+    best = found[0]
+    left = [f for f in found if f.chi2 - best.chi2 < EXCLUDED_SIGMA**2 * (1 + best.scatter2)]
+    if near is not None:
+        there = rotation.unit_vector(near[1], near[0])
+        return max(left, key=lambda f: float(f.zenith @ there))
+    if max(np.linalg.norm(f.zenith - best.zenith) for f in left) > 2 * EXCLUDED_SIGMA * _wide(best):
+        raise FixError(
+            "the elevations leave two places and two A3: turn the camera to directions of other altitudes too, state A3 "
+            "better, or say where it is with --near LAT LON"
+        )
+    return best
+
+
+def _axes(circles_of: CirclesOf, given: Calibration, ray: np.ndarray, site: Place | None) -> list[FoundAxis]:
+    """The answers, the one that fits best first; FixError without any."""
+    if site is not None:
+        zeniths = [site.plumb_axes[2]]
+    else:
+        first = Directions.of(sorted(circles_of(given.a3), key=lambda c: c.utc_unix_s))
+        tried = sorted(starts(first), key=lambda z: float(np.median(np.abs(first.residual(z)[0]))))
+        zeniths = [*_round(first), *tried[:TRIED]]
+    sigma = None if site is None else site.plumb_stddev
+    found = [_fitted(circles_of, given, ray, zenith, sigma) for zenith in zeniths]
+    if not any(found):
+        raise FixError(
+            "the elevations do not determine A3: check the tilts, the clock and that nothing was moved"
+        )
+    return sorted((f for f in found if f is not None), key=lambda f: f.chi2)
+
+
+def _contradicting(best: FoundAxis, given: Calibration, site: Place | None) -> set[float]:
+    """Times of the frames whose directions contradict the others; none if they are too few to judge, or too many.
+
+    They are judged from the least sum of residuals instead of squares, which a blunder does not pull towards itself
+    (Bloomfield and Steiger, Least Absolute Deviations, 1983), by weights that follow the residuals.
+    """
+    number, free = best.directions, best.directions - (2 if site is not None else 4)
+    if number < MIN_JUDGED or best.off.max() < OUTLIER_SIGMA:
+        return set()
+    sigma = None if site is None else site.plumb_stddev
+    problem = _Problem(best.a3, best.circles, given, best.ray, sigma)
+    off, a3, zenith = best.off, best.a3, best.zenith
+    for _ in range(REWEIGHTED):
+        problem.doubt = np.maximum(off - 1, 0.0)
+        robust = problem.descended(a3, zenith)
+        if robust is None:
+            return set()
+        off, a3, zenith = robust.off, robust.a3, robust.zenith
+    wrong = np.flatnonzero(off > OUTLIER_SIGMA * max(usual_sigma(off, free), 1.0))
+    if len(wrong) > MAX_OUTLIERS * number:
+        return set()
+    return {c.utc_unix_s for k in wrong for c in problem.part.circles[k]}
+
+
+def _known(given: Calibration, axis: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Covariance (2, 2) in rad2 with which a calibration knows an axis (3,) along `across` (2, 3)."""
+    turns = np.cross(axis, across)
+    about = np.asarray(given.covariance_arcsec2, float) * ARCSEC**2
+    return turns @ about @ turns.T + MIN_RAD**2 * np.eye(2)
+
+
+def _wide(found: FoundAxis) -> float:
+    """How far (rad) a zenith may be from another that is the same answer."""
+    return float(max(np.sqrt(np.linalg.eigvalsh(found.covariance)[-1]), 1e-6))
+
+
+def _round(part: Directions) -> list[np.ndarray]:
+    """Zeniths (3,) about which all directions lie on a circle, as they do where the sensor leans alike in all."""
+    axes = np.array([group[0].itrs for group in part.circles])
+    if len(axes) < 3:
+        return []
+    normal = np.linalg.svd(axes - axes.mean(0))[2][-1]
+    return [normal, -normal]
+
+
+def _slope(circle: Circle, across: np.ndarray) -> np.ndarray:
+    """Change (2,) of a circle's measured zenith distance by a move of the axis along `across` (2, 3) in S."""
+    return -(across @ circle.up) / max(np.sin(circle.zenith_distance), 1e-9)
+
+
+class _Problem:
+    """The circles about an A3 (3, 3), of which refraction and errors stay as they are while the axis moves a little.
+
+    stated (D, D): without A3's error; doubt (D,): variance beyond it, as a share; bent (N,): the refractions.
+    zenith_sigma: None if the zenith is unknown.
+    """
+
+    def __init__(
+        self,
+        a3: np.ndarray,
+        circles: Sequence[Circle],
+        given: Calibration,
+        ray: np.ndarray,
+        zenith_sigma: float | None,
+    ) -> None:
+        self.circles, self.given, self.ray, self.zenith_sigma = circles, given, ray, zenith_sigma
+        self.part, self.up = Directions.of(circles), np.array([c.up for c in circles])
+        self.bent = np.array([c.zenith_distance for c in circles]) - _seen(self.up, a3 @ ray)
+        self.stated = np.sum([c for name, c in self.part.sources.items() if name != OF_A3], axis=0)
+        self.doubt: np.ndarray | float = 0.0
+
+    def at(self, a3: np.ndarray, zenith: np.ndarray) -> "_Normal | None":
+        """Linearise at an A3 and a zenith; None for an axis that some frames cannot have."""
+        axis = a3 @ self.ray
+        seen, stated = _seen(self.up, axis), self.stated
+        if np.sin(seen).min() < MIN_SINE or np.cos(seen).min() < MIN_COS_ZENITH:
+            return None
+        left, of_zenith = self.part.residual(zenith, seen + self.bent)
+        across = np.linalg.svd(axis[None])[2][1:]
+        slope = self.part.mean(self.up @ across.T / np.sin(seen)[:, None])
+        if self.zenith_sigma is None:
+            slope = np.hstack([slope, of_zenith])
+        else:
+            stated = stated + self.zenith_sigma**2 * of_zenith @ of_zenith.T
+        # how far the axis is from where it was given, in units of what is known of it
+        prior = np.linalg.inv(_known(self.given, axis, across))
+        off = across @ (axis - self.given.a3 @ self.ray)
+        doubted = np.diag(np.diag(stated) * self.doubt)
+        weighted = np.linalg.solve(stated + doubted, np.column_stack([left, slope]))
+        matrix, pull = slope.T @ weighted[:, 1:], slope.T @ weighted[:, 0]
+        matrix[:2, :2] += prior
+        pull[:2] += prior @ off
+        return _Normal(
+            a3=a3,
+            zenith=zenith,
+            across=across,
+            matrix=matrix,
+            pull=pull,
+            prior=prior,
+            chi2=float(left @ weighted[:, 0] + off @ prior @ off),
+            off=np.abs(left) / np.sqrt(np.diag(stated)),
+        )
+
+    def descended(self, a3: np.ndarray, zenith: np.ndarray) -> "_Normal | None":
+        """The least chi-square near an A3 and a zenith, by Levenberg and Marquardt's method.
+
+        Axis and zenith together lie in a narrow, bent valley where the sensor leans about alike in all directions.
+        """
+        damping, now, ray = FIRST_DAMPING, self.at(a3, zenith), self.ray
+        axis = rotation.normalised(a3 @ ray)
+        if now is None:
+            return None
+        for _ in range(AXIS_ROUNDS):
+            damped = now.matrix + damping * np.diag(np.diag(now.matrix))
+            step = -np.linalg.solve(damped, now.pull)
+            step /= max(1.0, float(np.abs(step).max()) / MAX_STEP_RAD)
+            moved = rotation.normalised(now.a3 @ ray + step[:2] @ now.across)
+            # each from the first, because products of many turns grow apart from a rotation
+            tried_a3, there = rotation.shortest_turn(axis, moved) @ a3, now.zenith
+            if self.zenith_sigma is None:
+                there = rotation.normalised(there + step[2:] @ Directions.east_north(there))
+            tried = self.at(tried_a3, there)
+            if tried is None or tried.chi2 > now.chi2:
+                damping *= 10
+                if damping > LAST_DAMPING:
+                    break
+                continue
+            gain, now, damping = now.chi2 - tried.chi2, tried, damping / 10
+            if gain < SETTLED_CHI2:
+                break
+        return now
+
+
+def _seen(up: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Apparent zenith distances (N,) of an axis (3,) in S, where up (N, 3) is there."""
+    return np.arctan2(np.linalg.norm(np.cross(up, axis), axis=1), up @ axis)
+
+
+@at_once
+@dataclass(frozen=True, kw_only=True)
+class _Normal:
+    """The least-squares problem at an A3 (3, 3) and a zenith (3,): its unknowns are the axis, and perhaps the zenith.
+
+    off (D,): residuals in stated sigmas.
+    """
+
+    a3: np.ndarray
+    zenith: np.ndarray
+    across: np.ndarray
+    matrix: np.ndarray
+    pull: np.ndarray
+    prior: np.ndarray
+    chi2: float
+    off: np.ndarray
+
+
+def _fitted(
+    circles_of: CirclesOf,
+    given: Calibration,
+    ray: np.ndarray,
+    zenith: np.ndarray,
+    zenith_sigma: float | None,
+) -> FoundAxis | None:
+    """The answer near a zenith; None if it does not converge."""
+    a3, frames, now = given.a3, 0, None
+    for _ in range(RELINEARISED):
+        circles = sorted(circles_of(a3), key=lambda c: c.utc_unix_s)
+        # some frames cannot have that axis
+        if len(circles) < frames:
+            return None
+        frames, before = len(circles), a3
+        problem = _Problem(a3, circles, given, ray, zenith_sigma)
+        now = problem.descended(a3, zenith)
+        if now is None:
+            return None
+        a3, zenith = now.a3, now.zenith
+        if np.linalg.norm((a3 - before) @ ray) < SAME_AXIS_RAD:
+            break
+    assert now is not None
+    spread = np.linalg.inv(now.matrix)
+    told = len(spread) - float(np.trace(now.prior @ spread[:2, :2]))
+    number = len(problem.part.circles)
+    scatter2 = excess(now.chi2, int(number - np.floor(told + 1e-6)))
+    return FoundAxis(
+        a3=a3,
+        ray=ray,
+        zenith=zenith,
+        across=now.across,
+        covariance=spread[:2, :2] * (1 + scatter2),
+        scatter2=scatter2,
+        directions=number,
+        off=now.off,
+        chi2=now.chi2,
+        circles=circles,
+    )
