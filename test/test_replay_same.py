@@ -135,7 +135,7 @@ def play_as_others_do(graph, bag, rate):
         every = (*publishers.values(), clock)
         graph.wait(lambda: all(p.get_subscription_count() for p in every), "for who listens")
         begin_s, first_ns = time.monotonic(), None
-        for topic, log_ns, data in opened.messages(topics):
+        for topic, log_ns, data in opened.played(topics):
             first_ns = log_ns if first_ns is None else first_ns
             due_s = begin_s + (log_ns - first_ns) * 1e-9 / rate
             while time.monotonic() < due_s:

@@ -27,7 +27,7 @@ def test_a_message_that_unpacks_to_too_much_ends_the_replay(tmp_path, monkeypatc
             writer.write(topic, size, bytes(size))
     monkeypatch.setattr(bounds, "MAX_UNPACKED", 1 << 20)
     with Bag(tmp_path / "night") as bag:
-        messages = bag.messages(bag.topics(None, left_out=pytest.fail))
+        messages = bag.played(bag.topics(None, left_out=pytest.fail))
         assert next(messages)[2] == bytes(1 << 20)
         with pytest.raises(BagError, match="night: a part of it unpacks to more than"):
             next(messages)

@@ -27,7 +27,9 @@ SKIES = {
 
 @pytest.fixture(scope="module")
 def solver(catalogue):
-    return BlindSolver(catalogue)
+    solver = BlindSolver(catalogue)
+    solver.prepare()
+    return solver
 
 
 def axis_of(s):
