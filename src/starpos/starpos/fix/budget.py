@@ -122,7 +122,7 @@ def inverses(covariance: np.ndarray) -> np.ndarray:
 def gain_of(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Change (4, N, 2) of the parameters of a weighted fit for an error of one pixel of each star.
 
-    slope (N, 2, 4): derivatives by the parameters.  covariance (N, 2, 2) px2.  NaN if they cannot be told apart.
+    slope (N, 2, 4): derivatives by the parameters.  covariance (N, 2, 2) px2.  NaN if they cannot be separated.
     """
     weighted = (inverses(covariance) @ slope).reshape(-1, 4)
     try:

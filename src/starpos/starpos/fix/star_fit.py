@@ -205,7 +205,7 @@ def _extra_at(size: Callable[[float], float], share: float, most: float) -> floa
     """The extra variance, at most `most`, at which the size of squared residuals is `share`; 0 if it never is larger."""
     if size(0.0) <= share:
         return 0.0
-    # the logarithm of the size falls with that of the variance: not at all at first, at last as fast
+    # the logarithm of the size falls with the variance's: not at all at first, at last as fast
     here, falls = math.log(most), 1.0
     low, high, before = here + math.log(MIN_EXTRA), here, math.log(size(most) / share)
     for _ in range(MAX_SEARCHED):
