@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The work on one frame, as small objects that can be sent to any process or machine, where `OnFile` calls them."""
 
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -9,7 +10,7 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starpos.calibration.camera import lens_of_frame
+from starpos.calibration.camera import hour_by_lens, lens_of_frame
 from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, InstrumentError, StarposError
@@ -161,7 +162,7 @@ class Solving:
         known = self.instruments.instrument
         assert known is not None
         known, doubt = with_frame_size(replace(known, focal_px=lens[0], model=lens[1]), question.stars)
-        solver = Solver(known, catalogue.load_catalogue(), self.atmosphere, progress=self.progress)
+        solver = self._solver(known)
         sight = searching.answer_frame(solver, question)
         if self._by_phone(question.item) and sight.found is not None and known.camera is None and not doubt:
             # the lens of a telephone bends the field's corners by up to 100 px
@@ -174,6 +175,12 @@ class Solving:
                 question = replace(question, stars=sight.stars, known=sight.found)
             again = searching.answer_frame(replace(solver, instrument=known), question)
             sight = sight if again.found is None else again
+        if sight.solution.at_place is not None and known.axis_stddev_rad:
+            doubt = (
+                f"{question.item.place}: the picture is cut out of a larger one: its optical axis may be "
+                f"{math.degrees(known.axis_stddev_rad):.1g} deg from its centre, which the error contains: find it "
+                "with starpos calibrate --camera --site"
+            )
         return replace(sight, solution=sight.solution.with_remark(doubt), instrument=known)
 
     def solver(self, item: Frame | Stars) -> Solver:
@@ -186,12 +193,18 @@ class Solving:
                 f"{item.place}: its header has no focal length: give instrument=Instrument(focal_px)"
             )
         if not self._latest or self._latest[0].instrument != instrument:
-            stars = catalogue.load_catalogue()
-            solver = Solver(
-                instrument, stars, self.atmosphere, progress=self.progress, ephemeris=self.ephemeris
-            )
-            self._latest[:] = [solver]
+            self._latest[:] = [self._solver(instrument)]
         return self._latest[0]
+
+    def _solver(self, instrument: Instrument) -> Solver:
+        return Solver(
+            instrument,
+            catalogue.load_catalogue(),
+            self.atmosphere,
+            progress=self.progress,
+            ephemeris=self.ephemeris,
+            hour_by_lens=hour_by_lens,
+        )
 
     def after(self, sight: searching.Sight, hint: Hint) -> searching.Sight:
         """The sight of a frame that was not identified, if it looks where an earlier one did; else as it was."""
