@@ -64,8 +64,8 @@ class Fitted:
 
 
 @at_once
-@dataclass(frozen=True)
-class Adjustment:
+@dataclass(frozen=True, kw_only=True)
+class StarAdjustment:
     """Stars that a camera sees, and where an estimate of its attitude has them.
 
     xy (N, 2): px, where they are seen.  itrs (N, 3): their directions, along the axes which A4 takes into L.
@@ -126,7 +126,7 @@ class Adjustment:
         return c.lens.places(refraction.bend(v) @ self.g) * [scale * c.fx, scale * c.fy] + [c.cx, c.cy]
 
 
-def fitted(problem: Adjustment, local: np.ndarray, stated: np.ndarray) -> Fitted:
+def fitted(problem: StarAdjustment, local: np.ndarray, stated: np.ndarray) -> Fitted:
     """The fit of the stars, from a closed solution by Gauss-Newton over the rotation A4 and the plate scale.
 
     The derivatives are computed once: they hardly change over the remaining arcseconds.
@@ -319,7 +319,7 @@ class StarFit:
     residual (M, 2): fitted places minus seen places, px.
     """
 
-    problem: Adjustment
+    problem: StarAdjustment
     fit: Fitted
     errors: StarErrors
     residual: np.ndarray
@@ -395,7 +395,7 @@ def fit_stars(
 
     Raises FixError if the stars are too few or do not agree.
     """
-    problem = Adjustment(stars.xy, itrs, g, camera, refraction)
+    problem = StarAdjustment(xy=stars.xy, itrs=itrs, g=g, camera=camera, refraction=refraction)
     catalogue_px2 = ISOTROPIC * ((stars.place_sigma * camera.fx) ** 2)[:, None, None]
     stated = stars.covariance_px2 + catalogue_px2
     fit = fitted(problem, refraction.unbend(camera.directions(*stars.xy.T) @ g.T), stated)
@@ -407,12 +407,14 @@ def fit_stars(
     return _with_errors(problem, fit, stars.covariance_px2, catalogue_px2, stars.index)
 
 
-def seen_problem(xy: np.ndarray, camera: Camera, seen: np.ndarray) -> Adjustment:
+def seen_problem(xy: np.ndarray, camera: Camera, seen: np.ndarray) -> StarAdjustment:
     """The problem of N stars at xy (N, 2) px whose light comes from the directions seen (N, 3) along any axes.
 
     Nothing bends it on its way: A4 takes these axes into C.
     """
-    return Adjustment(xy, seen, np.eye(3), camera, BENT_ALREADY, on_ground=False)
+    return StarAdjustment(
+        xy=xy, itrs=seen, g=np.eye(3), camera=camera, refraction=BENT_ALREADY, on_ground=False
+    )
 
 
 def fit_seen(xy: np.ndarray, stated: np.ndarray, camera: Camera, seen: np.ndarray) -> StarFit:
@@ -426,7 +428,7 @@ def fit_seen(xy: np.ndarray, stated: np.ndarray, camera: Camera, seen: np.ndarra
 
 
 def _with_errors(
-    problem: Adjustment,
+    problem: StarAdjustment,
     fit: Fitted,
     centroids_px2: np.ndarray,
     catalogue_px2: np.ndarray,
