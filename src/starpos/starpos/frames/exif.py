@@ -20,9 +20,8 @@ from datetime import datetime, timezone
 
 from starpos.errors import FrameError, TimeError
 from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S, Exposure
-from starpos.frames.gravity import Gravity, contradicts, felt_up
+from starpos.frames.gravity import TELEPHONES, read_gravity, read_upper_edge
 
-TELEPHONES = re.compile(r"apple|google|samsung|xiaomi|huawei|oneplus|motorola|oppo|vivo", re.IGNORECASE)
 # Canon and Nikon allow their clocks an error of a minute a month. A telephone's is set by its network, a DJI's by GPS.
 UNTENDED_STDDEV_S, NETWORK_STDDEV_S = 60.0, 1.0
 NETWORKED = re.compile(f"dji|{TELEPHONES.pattern}", re.IGNORECASE)
@@ -41,20 +40,6 @@ SAME_SHAPE = 0.02
 # A lens, or a camera with its lens, that is called a fisheye: "EF8-15mm f/4L FISHEYE USM", "AF Fish-Eye-Nikkor 16mm".
 FISHEYE = re.compile(r"fish[ _-]?eye", re.IGNORECASE)
 NAMES = ("EXIF LensModel", "EXIF LensMake", "Image Model", "Image Make")
-# Programs that crop, turn or bend pictures and keep the maker's note.
-EDITOR = re.compile(
-    r"photoshop|lightroom|gimp|snapseed|capture one|darktable|rawtherapee|picasa|imagemagick|affinity|luminar|hugin|ptgui"
-    r"|pixelmator|vsco|photos \d|picsart|\bon1\b|dxo",
-    re.IGNORECASE,
-)
-# CustomRendered of a panorama by Apple.
-PANORAMA = 6
-# Sides of any single exposure: beyond this it is stitched.
-LONGEST_SHAPE = 2.4
-# A telephone's pictures have sides that this divides; cut-outs have any.
-WHOLE = 4
-# Direction in C of the edge of the picture that was up, by EXIF's Orientation.
-EDGES = {1: (0, -1), 3: (0, 1), 6: (-1, 0), 8: (1, 0)}
 # Limits of the focal length over the frame's diagonal, beyond any lens.
 SHORTEST, LONGEST = 0.1, 1000.0
 
@@ -184,40 +169,6 @@ class Exif:
         return latitude * (-1 if south == "S" else 1), longitude * (-1 if west == "W" else 1)
 
     @property
-    def upper_edge(self) -> tuple[int, int]:
-        """Direction in C of the edge of the picture that was up, by its Orientation; 0, 0 if it is not stated."""
-        return EDGES.get(int(self.number("Orientation", "Image") or 0), (0, 0))
-
-    @property
-    def is_telephones(self) -> bool:
-        """Whether a telephone took the picture."""
-        return TELEPHONES.match(self.text("Image Make")) is not None
-
-    def check_whole(self) -> None:
-        """Raise FrameError unless the pixels lie as the sensor of a telephone's back camera gave them."""
-        width, height = self.width, self.height
-        if EDITOR.search(software := self.text("Image Software")):
-            raise FrameError(f"it was edited by {software}, so its pixels may not lie as its level says")
-        if self.number("CustomRendered") == PANORAMA or max(width, height) > LONGEST_SHAPE * min(
-            width, height
-        ):
-            raise FrameError("it is a panorama, stitched of several exposures")
-        if "front" in self.text("EXIF LensModel"):
-            raise FrameError("it is by the telephone's front camera, whose level is not known")
-        if height > width or width % WHOLE or height % WHOLE:
-            raise FrameError(
-                "its pixels were turned or cut out by a program, and the gravity in its file was not"
-            )
-
-    def gravity(self, data: bytes) -> Gravity:
-        """Up in the picture by its bytes, or by the bytes of its EXIF; FrameError says why its file does not say so."""
-        up = felt_up(data)
-        self.check_whole()
-        if contradicts(self.upper_edge, up):
-            raise FrameError("its Orientation contradicts its level: a program turned it")
-        return Gravity(up, " ".join(self.text(f"Image {name}") for name in ("Make", "Model")).strip())
-
-    @property
     def clock_stddev_s(self) -> float:
         """Standard deviation of a clock as this maker's are set, s."""
         networked = NETWORKED.match(self.text("Image Make"))
@@ -297,19 +248,14 @@ def read_exposure(data: bytes, place: str, clock: CameraClock | None, shape: tup
             return Exposure(source=place)
         raise FrameError(f"{place}: reading EXIF needs exifread; run `pip install exifread`.") from None
     try:
-        gravity, unlevelled = exif.gravity(data), ""
+        gravity, unlevelled = read_gravity(data, exif.width, exif.height), ""
     except FrameError as e:
         gravity, unlevelled = None, str(e)
-    upper_edge = None
-    if exif.is_telephones:
-        with suppress(FrameError):
-            exif.check_whole()
-            upper_edge = exif.upper_edge
     exposure = Exposure(
         source=place,
         gravity=gravity,
         unlevelled=unlevelled,
-        upper_edge=upper_edge,
+        upper_edge=read_upper_edge(data, exif.width, exif.height),
         gps_deg=exif.gps_deg,
         exposure_s=exif.exposure_s,
         rough_focal_px=exif.rough_focal_px,

@@ -12,11 +12,11 @@ import numpy as np
 from starpos import rotation
 from starpos.errors import InstrumentError, TiltError
 from starpos.frames.exposure import Exposure, Shutter
-from starpos.frames.gravity import PHONE, contradicts
+from starpos.frames.gravity import contradicts
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Mounting
-from starpos.instrument.sensors import find, unnamed
+from starpos.instrument.sensors import built_in_rad, find, is_built_in, unnamed
 from starpos.instrument.tilt_log import Tilts
 from starpos.units import ARCSEC, DAY_S, utc_text
 
@@ -75,8 +75,6 @@ def level_errors(sag_arcsec_per_sqrt_hour: float) -> InclinometerErrors:
     return replace(EXACT, noise_rad=NO_NOISE, drift_rad_per_sqrt_hour=sag_arcsec_per_sqrt_hour * ARCSEC)
 
 
-# 1 sigma about each axis of a telephone's level against its camera: zero 0.25 deg and axes 0.25 deg; 0.24 deg measured
-PHONE_LEVEL_ARCSEC = 0.354 * 3600
 # the reading of that level
 OWN_LEVEL = Tilt(0.0, 0.0, np.eye(2) * NO_NOISE**2, utc_unix_s=0.0)
 NO_GRAVITY = (
@@ -101,19 +99,23 @@ class ByGravity:
         return (frame.gravity if self.log is None else frame.upper_edge) is not None
 
     def of(self, frame: Exposure, instrument: "Instrument") -> Tilts:
-        """The tilts of a photograph, of three axes; TiltError if its file states no gravity, or by another camera."""
-        gravity = frame.gravity
+        """The tilts of a photograph, of three axes; TiltError if its file states no gravity, or by another level."""
+        gravity, model = frame.gravity, instrument.inclinometer_model
         if not self.has(frame) or frame.mid_unix_s is None:
             raise self.missing(frame)
         if self.log is not None:
             return self.log
         assert gravity is not None
+        if gravity.model != model and is_built_in(model):
+            raise TiltError(
+                f"{frame.place}: its level is a {gravity.model}'s, the others' a {model}'s: solve them apart"
+            )
         if self.camera and gravity.camera != self.camera:
             raise TiltError(
                 f"{frame.place}: it is by another camera ({gravity.camera}) than the first ({self.camera}), whose level "
                 "errs otherwise: solve them apart"
             )
-        variance = instrument.inclinometer.noise_rad**2
+        variance = instrument.inclinometer.noise_rad**2 + gravity.stddev_rad**2
         theta_x, theta_y, theta_z = np.arcsin(np.clip(gravity.up, -1, 1)).tolist()
         return Tilt(
             theta_x,
@@ -418,16 +420,17 @@ class Instrument:
 
     @property
     def has_level_inside(self) -> bool:
-        """Whether the inclinometer is a telephone's own, whose axes are near its camera's."""
-        return self.inclinometer_model == PHONE and not self.calibration.unknown
+        """Whether the inclinometer is a camera's own, whose axes are near the camera's."""
+        return is_built_in(self.inclinometer_model) and not self.calibration.unknown
 
-    def with_phones_level(self) -> "Instrument":
-        """The instrument with the level of a telephone, as far as A3 and the inclinometer are unknown."""
+    def levelled_by(self, model: str) -> "Instrument":
+        """The instrument with a level of this model inside its camera, as far as A3 and the inclinometer are unknown."""
         known = self
         if self.calibration.unknown:
-            known = replace(known, calibration=Calibration.of((0.0, 0.0, 0.0), (PHONE_LEVEL_ARCSEC,) * 3))
+            stddev = built_in_rad(model) / ARCSEC
+            known = replace(known, calibration=Calibration.of((0.0, 0.0, 0.0), (stddev,) * 3))
         if not self.inclinometer_model and self.inclinometer == unnamed():
-            name, errors = find(PHONE)
+            name, errors = find(model)
             known = replace(known, inclinometer=errors, inclinometer_model=name)
         return known
 

@@ -47,15 +47,38 @@ def _sigma(row: Mapping[str, str]) -> float:
 SCA100T_CALIBRATED = InclinometerErrors()
 
 
+# Row of a level inside a camera: 1 sigma of its zero and of its axes against the camera's, together, about each axis.
+BUILT_IN = "built_in_rad"
+
+
 @lru_cache(maxsize=1)
-def presets() -> Mapping[str, InclinometerErrors]:
-    """The errors of each inclinometer with a name."""
+def _rows() -> Mapping[str, Mapping[str, float]]:
+    """The figures of each model, by their fields."""
     text = resources.files(__package__).joinpath("data", "sensors.csv").read_text("utf-8")
     rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
     models = groupby(rows, lambda r: r["model"])
+    return MappingProxyType({model: {r["field"]: _sigma(r) for r in of_model} for model, of_model in models})
+
+
+@lru_cache(maxsize=1)
+def presets() -> Mapping[str, InclinometerErrors]:
+    """The errors of each inclinometer with a name."""
     return MappingProxyType(
-        {model: InclinometerErrors(**{r["field"]: _sigma(r) for r in of_model}) for model, of_model in models}
+        {
+            model: InclinometerErrors(**{name: sigma for name, sigma in of_model.items() if name != BUILT_IN})
+            for model, of_model in _rows().items()
+        }
     )
+
+
+def is_built_in(model: str) -> bool:
+    """Whether a model is a camera's own level."""
+    return BUILT_IN in _rows().get(model, ())
+
+
+def built_in_rad(model: str) -> float:
+    """1 sigma about each axis of a camera's own level against it, its zero included; KeyError if it is not one."""
+    return _rows()[model][BUILT_IN]
 
 
 @lru_cache(maxsize=1)

@@ -17,6 +17,7 @@ from starpos.errors import FrameError, TiltError
 from starpos.files import open_regular, read_regular
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame, Stars
+from starpos.frames.gravity import PHONE
 from starpos.frames.reading import FITS, HEIF, JPEG, PICTURE, RAW, are_photographs
 from starpos.frames.tables import GNSS, SIMULATED, TILTS, TRUTH
 from starpos.gnss.receiver import GnssTrack, read_gnss_csv
@@ -106,7 +107,8 @@ def work_of(
     # a telephone's log has its camera's axes, unless another A3 is stated
     by_log = by_log and (known is None or known.calibration.unknown)
     if by_log or isinstance(tilts, ByGravity):
-        known = None if known is None else known.with_phones_level()
+        model = PHONE if by_log or first.gravity is None else first.gravity.model
+        known = None if known is None else known.levelled_by(model)
         if known is not None and (by_log or first.gravity is not None):
             own = of_gravity(known, by_log)
     instruments, remarks = replace(given, instrument=known).framed(first)

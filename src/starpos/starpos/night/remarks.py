@@ -17,6 +17,7 @@ from starpos.fix.budget import local_north
 from starpos.fix.fix import Fix, length_text
 from starpos.fix.solution import Solution
 from starpos.fix.terms import Origin, total_covariance
+from starpos.frames.gravity import PHONE
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt, level_of, up_of
 from starpos.instrument.instrument import Calibration, Instrument
@@ -56,11 +57,8 @@ def of_gravity(instrument: Instrument, by_log: bool = False) -> tuple[Remark, ..
     """Say what a place by photographs rests on; instrument: with their level.  by_log: a telephone's log is it."""
     if not instrument.has_level_inside:
         return ()
-    where = (
-        "the telephone's log, as the camera's own"
-        if by_log
-        else "the gravity in the files, felt by the telephone"
-    )
+    level = "felt by the telephone" if instrument.inclinometer_model == PHONE else "by the camera's level"
+    where = "the telephone's log, as the camera's own" if by_log else f"the gravity in the files, {level}"
     sentence = f"the level is {where}; time, zone and lens are the files', and their GPS is only compared"
     return (Remark(sentence),)
 
