@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from starpos.detection._fit import Rules, fit_stamps
-from starpos.detection._vetting import brightest_left, count_marked
+from starpos.detection._vetting import brightest_left
 from starpos.detection.psf import Psf
 from starpos.detection.stamps import Stamps, StarRows, joined
 
@@ -230,10 +230,10 @@ def _off_centre_px(stamps: Stamps, fit: Fit) -> np.ndarray:
 
 def surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
     """Whether stars (N,) leave more light unexplained than a single star does."""
-    freedom = np.maximum(fit.pixels - 3, 1)
+    freedom, outliers = np.maximum(fit.pixels - 3, 1), np.count_nonzero(fit.outlier, axis=(1, 2))
     with np.errstate(invalid="ignore"):
-        odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (count_marked(fit.outlier) > 2)
-    return odd & (count_marked(stamps.full) == 0) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
+        odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (outliers > 2)
+    return odd & ~stamps.full.any((1, 2)) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
 
 
 def _model_light(stamps: Stamps, psf: Psf, fit: Fit) -> np.ndarray:

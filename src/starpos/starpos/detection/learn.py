@@ -10,7 +10,6 @@ from scipy import spatial
 
 from starpos.detection._learn import (
     choose_terms,
-    fit_field,
     fit_field_robustly,
     light_noise,
     marginal_equations,
@@ -180,9 +179,7 @@ def _absorbed(psf: Psf, field: np.ndarray, terms: Terms, found: np.ndarray) -> t
     a, b, c = varied @ field[:, 1:].T
     change = np.stack([1 + np.sqrt(2) * a, b, b, 1 + np.sqrt(2) * c], -1).reshape(-1, 2, 2)
     root = power(np.tensordot(field[:, : len(psf.widths)], psf.widths, 1), 0.5)
-    widths = fit_field(field, (root @ change @ root).reshape(-1, 4))
-    if widths is None:
-        return psf, found
+    widths = np.linalg.lstsq(field, (root @ change @ root).reshape(-1, 4), rcond=None)[0]
     found = found.copy()
     found[terms.second, 1:] = 0
     return psf.with_widths(widths.reshape(-1, 2, 2)), found

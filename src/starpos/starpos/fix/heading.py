@@ -33,7 +33,8 @@ MIN_SHARE, REFRACTION_SIGMAS = 0.5, 5.0
 ZENITH_SIGMAS, ZENITH_RAD = 5.0, math.radians(2)
 # residuals beyond the stars' errors are of the lens, and alike for neighbours: number of independent ones on a frame
 LENS_VALUES = 20
-# a zenith that refraction shows to this (rad) confirms the hour
+# a zenith that refraction shows within this (rad), with two sigma, confirms the hour: with an hour that is wrong it is
+# some 5 deg off, because the lens takes up the rest of 15
 CONFIRMED_RAD = math.radians(3)
 # step of the numerical derivatives, rad
 STEP_RAD = 1e-3
@@ -181,8 +182,14 @@ def _zenith_shown(seen: StarFit, leaned: np.ndarray, atmosphere: Atmosphere) -> 
     kept = seen.fit.kept
     moved = (leaned[kept] - (seen.problem.xy + seen.fit.residual)[kept, :, None]) / STEP_RAD
     found, covariance = seen.more(moved, atmosphere)
-    lean = checked_zenith(found, covariance * feigned(seen.fit.jitter2, seen.errors.centroids))
-    return lean[1] < CONFIRMED_RAD
+    return confirms_hour(
+        *checked_zenith(found, covariance * feigned(seen.fit.jitter2, seen.errors.centroids))
+    )
+
+
+def confirms_hour(lean: float, sigma: float) -> bool:
+    """Whether the zenith by refraction, so far (rad) from the one by time and place, shows that these fit."""
+    return lean + 2 * sigma < CONFIRMED_RAD
 
 
 def feigned(jitter2: float, stated: np.ndarray) -> float:
