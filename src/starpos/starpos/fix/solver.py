@@ -46,6 +46,7 @@ from starpos.identification.pose import MIN_SIGMA_PX, TEST_STARS
 from starpos.identification.prior import AimPrior, Hint
 from starpos.identification.search import (
     Look,
+    Priors,
     identify_near,
     second_look,
     through,
@@ -153,15 +154,17 @@ class Solver:
         Sky(catalogue, triangles).load()
         return deeper.too_thin(catalogue, camera)
 
-    def identify(self, stars: Stars, part: float = 1.0) -> Solution:
-        """Names of the stars and pointing of the camera.
+    def identify(self, stars: Stars, predicted: Priors = (), part: float = 1.0) -> Solution:
+        """Names of the stars and pointing of the camera, near a prediction or anywhere.
 
         Stars without a time have J2000 places.
         part: of the frame in which its stars lie, as a share of its size: triangles that are looked up are no larger.
         """
-        return self._identified(stars, part, lambda field, sky, _: identify(field, sky, _aims(stars, field)))
+        return self._identified(
+            stars, part, lambda field, sky, _: identify(field, sky, (*predicted, *_aims(stars, field)))
+        )
 
-    def look_again(self, stars: Stars, look: Look, part: float = 1.0) -> Solution:
+    def look_again(self, stars: Stars, look: Look, predicted: Priors = (), part: float = 1.0) -> Solution:
         """Identify stars that alone are too few, by what their frame shows where others should be.
 
         Only for a frame on which `identify` has failed; a fisheye's stays unidentified.
@@ -171,7 +174,7 @@ class Solver:
             field: FrameStars | fisheye.WideField, sky: Sky, camera: Camera
         ) -> Identification | None:
             if isinstance(field, FrameStars):
-                return second_look(field, sky, _aims(stars, field), camera, look)
+                return second_look(field, sky, (*predicted, *_aims(stars, field)), camera, look)
             return None
 
         return self._identified(stars, part, by_looking)
@@ -202,18 +205,19 @@ class Solver:
         stars: Stars,
         tilts: Tilts = NO_TILTS,
         hint: Hint | None = None,
+        predicted: Priors = (),
         known: Identification | Hint | None = None,
     ) -> Solution:
         """The fix of one frame; a fault of the frame, the tilt or the time is a status and never an exception.
 
         tilts: not used for a camera that is its own level.
-        hint: where to look, of an earlier solution; a wrong one costs 0.5 ms and does no harm.
+        predicted, hint: where to look, the latter of an earlier solution; a wrong one costs 0.5 ms and does no harm.
         known: an identification of these stars, or a hint outside of which they are not to be searched.
         """
         if (rows := self._inside(stars)) is not None:
             if isinstance(known, Identification):
                 known = known.but(star=np.searchsorted(rows, known.star))
-            return self.solve(stars.select(rows), tilts, hint, known).among(stars, rows)
+            return self.solve(stars.select(rows), tilts, hint, predicted, known).among(stars, rows)
         try:
             state, tilt = self.levelled(stars, tilts)
             camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
@@ -223,7 +227,7 @@ class Solver:
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
             field = field_of(directions, mean_sigma(stars.covariance), camera, stars.window)
             if known is None:
-                priors = (*(hint.priors(state, g[2]) if hint else ()), *_aims(stars, field))
+                priors = (*predicted, *(hint.priors(state, g[2]) if hint else ()), *_aims(stars, field))
                 found = identify(field, sky, priors)
             elif isinstance(known, Hint):
                 found = identify_near(field, sky, known.priors(state, g[2]))
