@@ -35,15 +35,19 @@ emulated: build
 	@tools/setup/counterparts
 	@. tools/env.sh && python tools/demo/emulated_instrument.py $(ARGS)
 
-# what tests run against comes while the build computes; of what other versions need, too, which nobody waits for here: tools/test.py
-# looks for the whole of it, brings what lacks, and says so
+# what tests run against comes while the set-up and the build compute; of what other versions need, too, which nobody waits for here:
+# tools/test.py looks for the whole of it, brings what lacks, and says so
 ifneq (,$(findstring --both,$(ARGS)))
-bring_versions = tools/setup/docs; tools/setup/ubuntu packages; tools/setup/core python3.10 packages; tools/setup/core python3.13 packages
+bring_early = tools/setup/core python3.10 packages; tools/setup/core python3.13 packages
+bring_late = tools/setup/ubuntu packages; tools/setup/docs
 else
-bring_versions = true
+bring_early = true
+bring_late = true
 endif
-test: .underlay/stamp
-	@{ $(bring_versions); } >/dev/null 2>&1 & tools/setup/counterparts & bringing=$$!; status=0; \
+test:
+	@{ $(bring_early); } >/dev/null 2>&1 & tools/setup/counterparts apt & bringing=$$!; \
+	$(MAKE) --no-print-directory .underlay/stamp || exit; wait $$bringing || true; \
+	{ $(bring_late); } >/dev/null 2>&1 & tools/setup/counterparts & bringing=$$!; status=0; \
 	$(MAKE) --no-print-directory build || status=$$?; wait $$bringing || true; exit $$status
 	@. tools/env.sh && python tools/test.py $(ARGS)
 

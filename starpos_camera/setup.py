@@ -14,7 +14,7 @@ setup(
     install_requires=["setuptools", "numpy", "pyyaml"],
     zip_safe=True,
     maintainer="starpos maintainers",
-    description="The starpos camera: frames from cameras, video, files or a simulated sky, and the stars in them.",
+    description="The starpos camera: frames from cameras, files or a simulated sky, and the stars in them.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     entry_points={

@@ -124,7 +124,7 @@ def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
     secured("starpos_solver", "solver", sim, "gyro:=true", elements)
     secured("starpos_solver", "navigator", sim, "publish_tf:=true")
     secured("starpos_camera", "camera", sim, *SKY)
-    secured("starpos_camera", "detector", sim, "gyro:=true", "trails:=true", "day_exposure:=true")
+    secured("starpos_camera", "detector", sim, "trails:=true", "day_exposure:=true")
     secured("starpos_inclinometer", "inclinometer", sim, "source:=imu")
     secured("starpos_bringup", "record", arguments=(str(tmp_path / "bag"), "--images"))
     secured("starpos_bringup", "folder", arguments=(str(tmp_path / "night"),))
@@ -138,7 +138,7 @@ def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
 
 def test_the_policy_holds_for_camera_and_detector_in_one_process(graph, secured):
     graph.hear(Image, "detector/image_annotated")
-    all_of_it = "gyro:=true", "trails:=true", "day_exposure:=true"
+    all_of_it = "trails:=true", "day_exposure:=true"
     secured("starpos_camera", "camera_detector", "use_sim_time:=true", *all_of_it, *SKY)
     hold(graph, "/starpos/camera_detector")
 

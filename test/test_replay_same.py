@@ -135,7 +135,7 @@ def play_as_others_do(graph, bag, rate):
         every = (*publishers.values(), clock)
         graph.wait(lambda: all(p.get_subscription_count() for p in every), "for who listens")
         begin_s, first_ns = time.monotonic(), None
-        for topic, log_ns, data in opened.messages(topics):
+        for topic, log_ns, data in opened.played(topics):
             first_ns = log_ns if first_ns is None else first_ns
             due_s = begin_s + (log_ns - first_ns) * 1e-9 / rate
             while time.monotonic() < due_s:
@@ -161,8 +161,6 @@ def test_a_player_who_asks_nobody_gives_the_same_where_nothing_is_dropped(
 def test_what_such_a_player_loses_is_named(graph, run):
     graph.node.destroy_publisher(graph.tilt)
     graph.tilt = graph._publisher(Tilt, "tilt", 1000)
-    for _ in range(7):
-        graph.tilt.publish(Tilt())
     solver = run(
         "starpos_solver", "solver", "use_sim_time:=true", "qos_overrides./tilt.subscription.depth:=1"
     )
@@ -175,4 +173,3 @@ def test_what_such_a_player_loses_is_named(graph, run):
 
     graph.wait(lost, "for the warning")
     assert "messages were dropped on the way: play it slower" in solver.output
-    assert "messages came before this node listened: start it first" in solver.output

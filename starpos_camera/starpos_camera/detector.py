@@ -3,7 +3,6 @@
 
 import itertools
 import math
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -14,9 +13,8 @@ import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from rclpy.qos import ReliabilityPolicy
 from rclpy.time import Time
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
+from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
 from starpos.detection import Detection, DetectionSettings, detect
@@ -33,13 +31,12 @@ from starpos.messages.camera import (
 )
 from starpos.messages.stamp import stamp_to_unix
 from starpos.parameters.table import parameters_of
-from starpos.session.gyro_readings import Trails
 from starpos.session.pace import MAX_LATE_S, Pace
 from starpos_camera.after_solution import Annotator, TrailFinder
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, Troubles, time_is_simulated
 from starpos_common.messages import encoding_of, stars_to_message
 from starpos_common.parameters import declare
-from starpos_common.topics import MatchedSubscription, Take, publisher, subscription, subscription_from_any
+from starpos_common.topics import MatchedSubscription, Take, publisher, subscription
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture, StarArray
 from starpos_interfaces.srv import SetCapture
@@ -150,8 +147,6 @@ def wants_compressed(silent_s: float | None) -> bool:
     return silent_s is None or silent_s > RAW_PATIENCE_S
 
 
-# seconds of an IMU at 400 Hz
-IMU_QUEUE = 4000
 # Time that an image waits for its Capture, which comes on another topic: if a busy machine lost it, the middleware
 # repeats it when the next one is sent, or after 3 s.
 CAPTURE_PATIENCE_S = 3.5
@@ -244,14 +239,6 @@ class DetectorNode(Node):
         self._annotator = Annotator(self)
         self._day = DayExposure(self) if self._values["day_exposure"] else None
         self._trail_finder = TrailFinder(self) if self._values["trails"] else None
-        self._trails: Trails | None = None
-        # Held while the trails are used: the executor gives them readings, the worker's thread asks for a frame's.
-        self._turning = threading.Lock()
-        if self._values["gyro"]:
-            self._trails = Trails(self._values["calibration_url"])
-            best_effort = ReliabilityPolicy.BEST_EFFORT
-            subscription(self, Imu, "imu/data", self._on_imu, IMU_QUEUE, best_effort)
-            subscription_from_any(self, CameraInfo, "camera/camera_info", self._on_camera, 1)
         self._wake = self.create_guard_condition(self._on_wake)
         self._worker = Worker(self._detect, self._wake.trigger, "detection")
         self._diagnostics = Diagnostics(self, {"Stars": self._report})
@@ -294,23 +281,6 @@ class DetectorNode(Node):
     def _drop(self, frames: int = 1) -> None:
         """Note frames that were replaced by others."""
         self._pace.drop(time.monotonic(), frames)
-
-    def _on_imu(self, message: Imu) -> None:
-        # in a replay the stars would depend on which readings came before a frame
-        if not time_is_simulated(self):
-            self._tell_trails("imu/data", lambda trails: trails.receive_imu(message))
-
-    def _on_camera(self, message: CameraInfo, info: Mapping[str, Any]) -> None:
-        self._tell_trails("camera_info", lambda trails: trails.receive_camera(message))
-
-    def _tell_trails(self, name: str, tell: Callable[[Trails], None]) -> None:
-        assert self._trails is not None
-        try:
-            with self._turning:
-                tell(self._trails)
-            self._troubles.right(name)
-        except StarposError as error:
-            self._troubles.wrong(name, str(error))
 
     def _arrived(self) -> None:
         now = time.monotonic()
@@ -398,9 +368,6 @@ class DetectorNode(Node):
         begin, cpu = time.monotonic(), time.thread_time()
         make, header = job
         frame = make()
-        if self._trails is not None:
-            with self._turning:
-                frame = self._trails.with_trail(frame)
         detection = detect(frame, self._settings)
         message = stars_to_message(detection.stars, header.frame_id)
         # The stamp must be the frame's to the nanosecond, because others match messages by it.

@@ -12,9 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from attempts import attempt, made, values
 
-from starpos_camera.sources.source import CaptureError
-from starpos_camera.sources.video import _from_jpeg
+from starpos_camera.sources.source import CaptureError, CaptureSettings
+from starpos_camera.sources.video import Video, _from_jpeg
 from starpos_interfaces.msg import Capture
 from starpos_testing.lacking import lacks
 from starpos_testing.patience import WAIT_S
@@ -155,3 +156,21 @@ def test_a_jpeg_is_whole_or_none():
     for broken, size in ((data[:-500], (64, 48)), (data[:0], (64, 48)), (data, (48, 64))):
         with pytest.raises(CaptureError, match="no whole JPEG"):
             _from_jpeg(cv2, broken, *size)
+
+
+def test_what_is_no_camera_or_cannot_be_is_refused():
+    def refusal(device, **changes):
+        return Video.refusal(values("video", video__device=device, **changes), CaptureSettings(0.1, 3.0, 5.0))
+
+    for other in ("", "rtsp://camera/1", "http://127.0.0.1/a.avi", "a.avi"):
+        assert "of this machine" in refusal(other)
+    assert "video.format must be one of" in refusal("/dev/video0", video__format="H264")
+    assert "together" in refusal("0", video__width=640)
+    assert refusal("0", video__format="Y16") is None
+
+
+def test_a_camera_that_is_not_there_is_said():
+    source = made(values("video", video__device="/dev/v4l/by-id/none"))
+    assert not source.waits_for_listener and "plug it in" in source.lacking()
+    assert "cannot be opened as a camera" in attempt(source)
+    assert made(values("video", video__device="7")).hardware_id == "/dev/video7"

@@ -16,7 +16,7 @@ from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_si
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher
 from starpos_inclinometer.clock import HostClock
-from starpos_inclinometer.sources.registry import SOURCES, refusal
+from starpos_inclinometer.sources.registry import SOURCES
 from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings
 from starpos_interfaces.msg import Pulse, Tilt
 
@@ -104,7 +104,10 @@ class InclinometerNode(Node):
     def __init__(self) -> None:
         super().__init__("inclinometer")
         self._values = declare(
-            self, parameters_of("inclinometer"), apply=self._apply, check=lambda values, _: refusal(values)
+            self,
+            parameters_of("inclinometer"),
+            apply=self._apply,
+            check=lambda values, _: SOURCES[values["source"]].refusal(values),
         )
         self._publisher = publisher(self, Tilt, "tilt", 100)
         self._pulses = publisher(self, Pulse, "pulses", 100)

@@ -15,7 +15,7 @@ from starpos.messages.tilt import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock, Moment
 from starpos_inclinometer.sources.ascii_line import MAX_LINE, UNITS, AsciiSource, LineDecoder, TextLines
-from starpos_inclinometer.sources.registry import refusal
+from starpos_inclinometer.sources.registry import SOURCES
 from starpos_inclinometer.sources.source import Phase, Surroundings
 from starpos_testing.emulator import Pty
 from starpos_testing.patience import WAIT_S
@@ -210,15 +210,15 @@ def test_a_million_bytes_of_anything_never_raise_and_are_never_believed():
     ],
 )
 def test_bad_patterns_are_refused_in_one_sentence(pattern, words):
-    sentence = refusal(values(**{"ascii.pattern": pattern}))
+    sentence = AsciiSource.refusal(values(**{"ascii.pattern": pattern}))
     assert words in sentence and "\n" not in sentence
-    assert refusal(values(**{"ascii.pattern": pattern, "source": "serial"})) is None
+    assert SOURCES["serial"].refusal(values(**{"ascii.pattern": pattern})) is None
 
 
 def test_good_patterns_and_requests():
-    assert refusal(values(**{"ascii.pattern": FULL, "ascii.request": "?\r\n"})) is None
-    assert refusal(defaults_of("inclinometer") | {"source": "ascii"}) is None
-    assert "ASCII" in refusal(values(**{"ascii.request": "\xe9"}))
+    assert AsciiSource.refusal(values(**{"ascii.pattern": FULL, "ascii.request": "?\r\n"})) is None
+    assert AsciiSource.refusal(defaults_of("inclinometer") | {"source": "ascii"}) is None
+    assert "ASCII" in AsciiSource.refusal(values(**{"ascii.request": "\xe9"}))
 
 
 class Meter:

@@ -7,7 +7,6 @@ every 2 s.  Means of the last quarter: error of the place, 1 sigma an axis as cl
 hold), error of the heading; CPU time of a voyage without identification.
 """
 
-import math
 import time
 from collections.abc import Iterator
 
@@ -42,8 +41,6 @@ WINDS = {
     "drone, wind swings in 40 minutes": swinging_wind(0.3, 2400),
 }
 # Drones whose wind is said to change by so much in ten minutes, m/s; the second's changes as the law has it.
-KNOWN = {"drone, wind known to be steady": 0.03, "drone, wind said to be steady": 0.03}
-WINDS["drone, wind said to be steady"] = walking_wind(LAWS["drone"].drift_walk)
 # Rovers without odometry: that halt now and then, that seem to, and that halt without showing it.
 COURSE = halting(sway=0.1)
 DRIVES = {
@@ -61,9 +58,7 @@ CADENCE_S, RATE_HZ = 2.0, 50.0
 VOYAGE_S = 300.0
 
 
-def navigated(
-    record: MadeVoyage, vehicle: str, model: ImuModel, velocity: VelocityLog | None, drift_change: float
-) -> Voyage:
+def navigated(record: MadeVoyage, vehicle: str, model: ImuModel, velocity: VelocityLog | None) -> Voyage:
     """The answer for a voyage whose mount is known to 1 deg."""
     vessel = Vessel(
         vehicle=vehicle,
@@ -72,7 +67,6 @@ def navigated(
         mount_stddev=np.radians(1.0),
         atmosphere=Atmosphere(pressure_pa=0.0),
         clock_stddev_s=1e-3,
-        drift_change=drift_change,
     )
     return adjust_voyage(record.frames, record.imu, velocity, vessel)
 
@@ -95,13 +89,13 @@ def scores(record: MadeVoyage, voyage: Voyage) -> np.ndarray:
 
 def scored(vehicle: str, grade: str, seconds: float, seed: int) -> tuple[np.ndarray, float]:
     """The scores of one voyage, and its CPU time in s."""
-    model, drive, known = GRADES[grade], DRIVES.get(vehicle), KNOWN.get(vehicle, math.nan)
+    model, drive = GRADES[grade], DRIVES.get(vehicle)
     about = {"model": model, "rate_hz": RATE_HZ, "cadence_s": CADENCE_S, "more_wind": WINDS.get(vehicle)}
     vehicle = vehicle.split()[0].rstrip(",")
     record = made(vehicle, seconds, 1000 + seed, drive=drive, **about)
     begin = time.process_time()
     velocity = None if vehicle == "drone" or drive is not None else record.velocity
-    found = scores(record, navigated(record, vehicle, model, velocity, known))
+    found = scores(record, navigated(record, vehicle, model, velocity))
     return found, time.process_time() - begin
 
 
@@ -117,7 +111,7 @@ def options(parser) -> None:
     parser.add_argument("--voyages", type=int, default=8, help="of each kind")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="of the first voyage (0)")
     parser.add_argument("--seconds", type=float, default=1200.0)
-    usual = tuple(dict.fromkeys([*VEHICLES, *WINDS, *KNOWN]))
+    usual = tuple(dict.fromkeys([*VEHICLES, *WINDS]))
     parser.add_argument("--vehicles", nargs="+", choices=(*usual, *DRIVES), default=usual)
 
 

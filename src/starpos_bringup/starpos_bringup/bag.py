@@ -101,20 +101,12 @@ class Topic:
     older: str
 
 
-class Bag:
+class Bag(BagReader):
     """A bag to play; everything in it is checked before it is used."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self._reader = BagReader(path)
+        super().__init__(path)
         self._older = OlderTypes()
-
-    def __enter__(self) -> "Bag":
-        self._reader.__enter__()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._reader.__exit__(*exception)
 
     def inputs(self, needed: str, others: tuple[str, ...], remaps: Remaps = NO_REMAPS) -> list[str]:
         """Find the topics of these relative names in any namespace, or the topics of a robot's own camera and IMU.
@@ -122,13 +114,12 @@ class Bag:
         Accelerations are used without tilts. Raises BagError if the needed one is missing, FrameError if several topics
         may be a robot's, or a remap is impossible.
         """
-        connections = self._reader.connections
-        names = sorted({c.topic for c in connections})
+        names = sorted({c.topic for c in self.connections})
         if not remaps and any(name.endswith("/" + needed) for name in names):
             of_tilt = () if any(name.endswith("/tilt") for name in names) else (IMU_DATA,)
             ends = tuple("/" + relative for relative in (needed, *others, *of_tilt))
             return [name for name in names if name.endswith(ends)]
-        found = driver_topics(connections, remaps, place=self.path) if needed == RAW else {}
+        found = driver_topics(self.connections, remaps, place=self.path) if needed == RAW else {}
         if not found:
             raise BagError(f"{self.path}: no topic {needed} in it; it has {', '.join(map(repr, names))}")
         return sorted(found.values())
@@ -138,14 +129,14 @@ class Bag:
 
         Raises BagError if one of the `wanted` (None: all) is not in the bag, or if nothing remains.
         """
-        names = {c.topic for c in self._reader.connections}
+        names = {c.topic for c in self.connections}
         for name in wanted or ():
             if name not in names:
                 raise BagError(
                     f"{self.path}: no topic {name} in it; it has {', '.join(sorted(map(repr, names)))}"
                 )
         topics = {}
-        for c in self._reader.connections:
+        for c in self.connections:
             if c.topic == "/clock" or (wanted and c.topic not in wanted):
                 continue
             try:
@@ -156,10 +147,9 @@ class Bag:
             raise BagError(f"{self.path}: there is nothing in it to play")
         return topics
 
-    def messages(self, topics: dict[int, Topic]) -> Iterator[tuple[Topic, int, bytes]]:
+    def played(self, topics: dict[int, Topic]) -> Iterator[tuple[Topic, int, bytes]]:
         """Read (topic, log time in ns, bytes) in the bag's order; raises BagError if the file breaks off."""
-        connections = [c for c in self._reader.connections if c.id in topics]
-        for connection, log_ns, data in self._reader.messages(connections):
+        for connection, log_ns, data in self.messages([c for c in self.connections if c.id in topics]):
             topic = topics[connection.id]
             yield (
                 topic,

@@ -95,7 +95,7 @@ def _rounds(
         before = player.count
         player.start_round()
         try:
-            for topic, log_ns, data in bag.messages(topics):
+            for topic, log_ns, data in bag.played(topics):
                 player.play(topic, log_ns, data)
                 if stopped:
                     break

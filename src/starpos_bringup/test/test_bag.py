@@ -31,7 +31,7 @@ def test_a_message_that_unpacks_to_too_much_ends_the_replay(tmp_path, monkeypatc
             writer.write(topic, size, bytes(size))
     monkeypatch.setattr(bounds, "MAX_UNPACKED", 1 << 20)
     with Bag(tmp_path / "night") as bag:
-        messages = bag.messages(bag.topics(None, left_out=pytest.fail))
+        messages = bag.played(bag.topics(None, left_out=pytest.fail))
         assert next(messages)[2] == bytes(1 << 20)
         with pytest.raises(BagError, match="night: a part of it unpacks to more than"):
             next(messages)
@@ -119,7 +119,7 @@ def test_solutions_that_knew_of_no_warnings_are_played_without_any(tmp_path, kin
         bag.write("solver/solution", bag.message("Solution", 1001.0, tilt=tilt, ids=["a"], status=7), 1001.0)
     with Bag(tmp_path / "night") as bag:
         topics = bag.topics(None, left_out=pytest.fail)
-        [(topic, _, data)] = bag.messages(topics)
+        [(topic, _, data)] = bag.played(topics)
     solved = deserialize_message(data, topic.kind)
     assert (solved.status, solved.ids, solved.warnings) == (7, ["a"], [])
     assert (solved.tilt.x, solved.tilt.z, solved.tilt.z_variance) == (0.1, 0.75, 1e-9)
@@ -143,7 +143,7 @@ def test_tilts_and_solutions_of_the_first_release_are_played_as_those_of_two_axe
         bag.write("solver/solution", solution, 1001.0)
     with Bag(tmp_path / "night") as bag:
         topics = bag.topics(None, left_out=pytest.fail)
-        said = {t.name: deserialize_message(data, t.kind) for t, _, data in bag.messages(topics)}
+        said = {t.name: deserialize_message(data, t.kind) for t, _, data in bag.played(topics)}
     played, solved = said["/tilt"], said["/solver/solution"]
     for got in (played, solved.tilt):
         assert (got.x, got.y, got.sequence, got.flags) == (0.1, -0.2, 7, 8)
@@ -165,7 +165,7 @@ def test_stars_of_the_first_release_are_played_as_those_of_an_unknown_shutter(tm
         bag.write("camera/capture", capture, 1000.5)
     with Bag(tmp_path / "night") as bag:
         topics = bag.topics(None, left_out=pytest.fail)
-        said = {t.name: deserialize_message(data, t.kind) for t, _, data in bag.messages(topics)}
+        said = {t.name: deserialize_message(data, t.kind) for t, _, data in bag.played(topics)}
     got, taken = said["/stars"], said["/camera/capture"]
     assert (got.width, got.height, got.clock_stddev) == (10, 20, 0.02)
     assert [(s.x, s.y, s.flags) for s in got.stars] == [(3.0, 4.0, 2)]
@@ -178,7 +178,7 @@ def test_a_broken_tilt_of_the_first_release_is_left_to_the_player(tmp_path):
         bag.write("tilt", bag.message("Tilt", 1000.5), 1000.5)
         bag._writer.write(bag._connections["/tilt"], 2, b"\0\1\0\0short")
     with Bag(tmp_path / "night") as bag:
-        *_, (_, _, data) = sorted(bag.messages(bag.topics(None, left_out=pytest.fail)), key=lambda m: -m[1])
+        *_, (_, _, data) = sorted(bag.played(bag.topics(None, left_out=pytest.fail)), key=lambda m: -m[1])
         assert data == b"\0\1\0\0short"
 
 

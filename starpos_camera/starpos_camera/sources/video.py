@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""V4L2 cameras and video files, through OpenCV.
+"""V4L2 cameras, through OpenCV.
 
-Of a camera the sensor's own pixels are taken if it sends them, and the kernel's time of each frame. OpenCV's V4L2 backend
+The sensor's own pixels are taken if the camera sends them, and the kernel's time of each frame. OpenCV's V4L2 backend
 (tried: 4.6 and 5.0) gives the kernel's buffer time as CAP_PROP_POS_MSEC. With CAP_PROP_CONVERT_RGB at 0 it gives the
 buffer itself, in the shape of its format or as plain bytes. It waits at most 10 s for a frame. Exposure is
 V4L2_CID_EXPOSURE_ABSOLUTE, in 100 us, if the menu of auto exposure is at 1. OpenCV does not report that a buffer is
@@ -9,7 +9,6 @@ short, but the kernel's uvcvideo drops such frames (its parameter nodrop is 0).
 """
 
 import math
-import os
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,18 +17,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starpos.errors import FrameError
 from starpos.frames.exposure import MAX_READOUT_S, Shutter
 from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos.frames.pictures import quiet_opencv
-from starpos_camera.sources.source import (
-    CapturedFrame,
-    CaptureError,
-    CaptureSettings,
-    DeviceSource,
-    SourceEnded,
-)
-from starpos_camera.sources.timing import read_utc
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource
 from starpos_interfaces.msg import Capture
 
 if TYPE_CHECKING:
@@ -71,76 +62,40 @@ FORMATS = (*MONO, *LUMA, *PLANAR, *MOSAIC, *COLOUR, *JPEG)
 
 
 class Video(DeviceSource["VideoCapture"]):
-    """A live V4L2 camera, or the frames of a video file, one after the other: making a Video makes the one it is."""
-
-    def __new__(cls, values: Mapping, now: Callable[[], float]) -> "Video":
-        return super().__new__(V4l2 if is_camera(values["video.device"]) else Film)
+    """Keeps the camera streaming; `capture` returns the first frame that was exposed after the call."""
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
         device = values["video.device"]
-        if not device or "://" in device:
+        if not (device.isdecimal() or device.startswith("/dev/")):
             return (
-                f"video.device must be a V4L2 camera or a video file of this machine, not {device!r}: streams of a "
-                "network do not state when a frame was taken."
+                f"video.device must be a V4L2 camera of this machine, below /dev, not {device!r}: video files and "
+                "streams of a network do not state when a frame was taken."
             )
-        if is_camera(device):
-            if values["video.format"] and values["video.format"].ljust(4) not in FORMATS:
-                known = ", ".join(f.strip() for f in FORMATS)
-                return f"video.format must be one of {known}, not {values['video.format']!r}."
-            if bool(values["video.width"]) != bool(values["video.height"]):
-                return "video.width and video.height must be given together."
-            return None
-        if Path(device).suffix.lower() not in SUFFIXES:
-            return (
-                f"video.device must be below /dev, or a video file ({', '.join(SUFFIXES)}), not {device!r}."
-            )
-        if read_utc(values["video.start"]) is None:
-            return (
-                "a video file does not state when it was taken: set video.start to the UTC of its first frame, as "
-                "2026-11-02T18:00:00.00."
-            )
-        if settings.exposure_s is not None or settings.gain:
-            return "a video file has its own exposure and gain: leave `exposure` and `gain` unset."
+        if values["video.format"] and values["video.format"].ljust(4) not in FORMATS:
+            known = ", ".join(f.strip() for f in FORMATS)
+            return f"video.format must be one of {known}, not {values['video.format']!r}."
+        if bool(values["video.width"]) != bool(values["video.height"]):
+            return "video.width and video.height must be given together."
         return None
 
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
         super().__init__(values, now)
         device = values["video.device"]
-        self.hardware_id = f"/dev/video{device}" if device.isdecimal() else str(Path(device).expanduser())
+        self.hardware_id = f"/dev/video{device}" if device.isdecimal() else device
+        self._format, self._size = "", (0, 0)
+        # Exposure and gain that were set last.
+        self._set: tuple[float | None, float | None] | None = None
+        # Frames before this steady time have other settings.
+        self._not_before_s = 0.0
 
     def lacking(self) -> str | None:
         if not Path(self.hardware_id).exists():
             return f"{self.hardware_id}: it is not there; plug it in, or correct video.device."
         return None
 
-    def _open(self) -> "VideoCapture":
-        with quiet_opencv() as cv2:
-            return self._opened(cv2)
-
-    def _opened(self, cv2: ModuleType) -> "VideoCapture":
-        """Open the camera or the file; CaptureError if it is not there."""
-        raise NotImplementedError
-
     def _close(self, device: "VideoCapture") -> None:
         device.release()
-
-
-def is_camera(device: str) -> bool:
-    """Whether a device is a camera; otherwise it is a file."""
-    return device.isdecimal() or device.startswith("/dev/")
-
-
-class V4l2(Video):
-    """Keeps the camera streaming; `capture` returns the first frame that was exposed after the call."""
-
-    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
-        super().__init__(values, now)
-        self._format, self._size = "", (0, 0)
-        # Exposure and gain that were set last.
-        self._set: tuple[float | None, float | None] | None = None
-        # Frames before this steady time have other settings.
-        self._not_before_s = 0.0
 
     def _expose(self, device: "VideoCapture", settings: CaptureSettings) -> CapturedFrame:
         with quiet_opencv() as cv2:
@@ -166,6 +121,10 @@ class V4l2(Video):
     def _explain(self, error: Exception) -> str:
         text = str(error) if isinstance(error, CaptureError) else f"{type(error).__name__}: {error}."
         return " ".join(text.split())
+
+    def _open(self) -> "VideoCapture":
+        with quiet_opencv() as cv2:
+            return self._opened(cv2)
 
     def _opened(self, cv2: ModuleType) -> "VideoCapture":
         capture = cv2.VideoCapture(self.hardware_id, cv2.CAP_V4L2)
@@ -322,131 +281,3 @@ def _from_jpeg(cv2: ModuleType, raw: np.ndarray, width: int, height: int) -> np.
     if pixels is None or pixels.shape != (height, width):
         raise CaptureError(f"a frame of {len(data)} bytes is no whole JPEG of {width} x {height} px.")
     return pixels
-
-
-# A QuickTime or MP4 file begins with one of these.
-BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
-BEGINNINGS = {
-    ".avi": (0, (b"RIFF",)),
-    ".mkv": (0, (b"\x1aE\xdf\xa3",)),
-    ".mov": (4, BOXES),
-    ".mp4": (4, BOXES),
-}
-SUFFIXES = tuple(BEGINNINGS)
-# In frames a second.
-MAX_RATE = 1000.0
-# The longest time between two frames.
-MAX_GAP_S = 3600.0
-# Cut-off or damaged frames are dropped, and a file must not lead to the network.
-OPTIONS = "fflags;discardcorrupt|err_detect;explode|protocol_whitelist;file"
-OPTIONS_IN = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
-# FFmpeg's tags of pixel formats: Y800, and Y1 of 16 bits.
-GREY_8, GREY_16 = 0x30303859, 0x10003159
-
-
-class Film(Video):
-    """Plays a file once. If its disk goes away and comes back, it goes on at the next frame."""
-
-    # Without a listener the first frames would be played before the detector is ready.
-    waits_for_listener = True
-
-    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
-        super().__init__(values, now)
-        self._path = self.hardware_id
-        started = read_utc(values["video.start"])
-        # Video.refusal has checked it.
-        assert started is not None
-        self._start_s, self._start_resolution_s = started
-        self._grey = False
-        self._period_s = 0.0
-        self._taken = 0
-        # In the file's own time.
-        self._first_s = self._last_s = -math.inf
-        self._ended = ""
-
-    def capture(self, settings: CaptureSettings) -> CapturedFrame:
-        if self._ended:
-            raise SourceEnded(self._ended)
-        return super().capture(settings)
-
-    def _explain(self, error: Exception) -> None:
-        """Return None: errors of a file have its path already."""
-
-    def _expose(self, device: "VideoCapture", settings: CaptureSettings) -> CapturedFrame:
-        self._check_there()
-        with quiet_opencv() as cv2:
-            came, pixels = device.read()
-            at_s = device.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            frames = device.get(cv2.CAP_PROP_FRAME_COUNT)
-        if not came:
-            self._ended = f"all {self._taken} frames of {self._path} are played."
-            if self._taken < frames:
-                raise FrameError(
-                    f"{self._path}: it breaks off after {self._taken} of {frames:.0f} frames; copy it again."
-                )
-            raise SourceEnded(self._ended)
-        if not self._last_s < at_s <= max(self._last_s, 0.0) + MAX_GAP_S:
-            self._ended = f"{self._path}: the times of its frames make no sense."
-            raise FrameError(
-                f"{self._ended[:-1]}: {self._last_s:g} s, then {at_s:g} s; convert it to a steady rate."
-            )
-        self._first_s = at_s if not self._taken else self._first_s
-        self._last_s = at_s
-        self._taken += 1
-        # OpenCV 4.6 makes three channels of one.
-        if self._grey and pixels.ndim == 3:
-            pixels = np.ascontiguousarray(pixels[..., 0])
-        # The exposure is somewhere within the period of the frame; its length is not known.
-        mid_s = self._start_s + at_s - self._first_s + self._period_s / 2
-        stddev_s = math.hypot(self._period_s, self._start_resolution_s) / math.sqrt(12)
-        frame = Frame(pixels, mid_unix_s=mid_s, source=self._path, stamp_stddev_s=stddev_s)
-        return CapturedFrame(frame, Capture.FILE)
-
-    def _check_there(self) -> None:
-        if not Path(self._path).is_file():
-            raise CaptureError(f"{self._path}: it is not there; correct video.device, or mount its disk.")
-
-    def _opened(self, cv2: ModuleType) -> "VideoCapture":
-        self._check_there()
-        at, beginnings = BEGINNINGS[Path(self._path).suffix.lower()]
-        try:
-            with open(self._path, "rb") as file:
-                head = file.read(16)
-        except OSError as error:
-            raise CaptureError(
-                f"{self._path}: it cannot be read ({error.strerror}); check its disk."
-            ) from None
-        # FFmpeg would take a playlist of other files under any name.
-        if head[at : at + 4] not in beginnings:
-            raise FrameError(
-                f"{self._path}: this is no {Path(self._path).suffix[1:].upper()} file; convert it to one."
-            )
-        before = os.environ.get(OPTIONS_IN)
-        os.environ[OPTIONS_IN] = OPTIONS
-        try:
-            capture = cv2.VideoCapture(self._path, cv2.CAP_FFMPEG)
-        finally:
-            if before is None:
-                del os.environ[OPTIONS_IN]
-            else:
-                os.environ[OPTIONS_IN] = before
-        if not capture.isOpened():
-            raise FrameError(
-                f"{self._path}: this is not a video that OpenCV's FFmpeg can read; convert it to FFV1."
-            )
-        width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
-        rate = capture.get(cv2.CAP_PROP_FPS)
-        if not (1 <= width * height <= MAX_PIXELS and 0 < rate <= MAX_RATE):
-            raise FrameError(
-                f"{self._path}: {width:g} x {height:g} px at {rate:g} frames a second are no video."
-            )
-        kind = int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) & 0xFFFFFFFF
-        self._grey = kind in (GREY_8, GREY_16)
-        if self._grey and not capture.set(cv2.CAP_PROP_CONVERT_RGB, 0) and kind == GREY_16:
-            raise FrameError(
-                f"{self._path}: OpenCV {cv2.__version__} makes 8 bits of its 16; use 4.7 or newer."
-            )
-        self._period_s = 1 / rate
-        for _ in range(self._taken):
-            capture.grab()
-        return capture

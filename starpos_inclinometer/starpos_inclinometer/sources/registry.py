@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sources by their name in the parameter `source`. A new sensor needs a module in this folder and a line below."""
 
-from collections.abc import Mapping
-from typing import Any
-
 from starpos_inclinometer.sources.ascii_line import AsciiSource
 from starpos_inclinometer.sources.iio import IioSource
 from starpos_inclinometer.sources.imu import ImuSource
@@ -16,8 +13,3 @@ SOURCES: dict[str, type[TiltSource]] = {
     "ascii": AsciiSource,
     "iio": IioSource,
 }
-
-
-def refusal(values: Mapping[str, Any]) -> str | None:
-    """Say in a sentence why the chosen source cannot be made of these values; None if it can."""
-    return SOURCES[values["source"]].refusal(values)

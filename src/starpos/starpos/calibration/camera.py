@@ -26,7 +26,7 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError, TimeError
 from starpos.fix.checks import check_risen
-from starpos.fix.heading import checked_zenith, feigned
+from starpos.fix.heading import checked_zenith, confirms_hour, feigned
 from starpos.fix.solver import ENOUGH_SOUND, high_enough
 from starpos.fix.star_fit import MatchedStars, sound_matches
 from starpos.frames.frame import Stars
@@ -411,6 +411,22 @@ def seen_by(
         longitude=site.longitude,
         height_m=0.0 if np.isnan(site.height_m) else site.height_m,
     )
+
+
+def hour_by_lens(
+    stars: Stars,
+    found: Identification,
+    given: Camera,
+    catalogue: Catalogue,
+    atmosphere: Atmosphere,
+    place: Place,
+) -> bool:
+    """Whether a fisheye's frame alone shows its hour, whatever its lens; PlaceError if it shows another one."""
+    try:
+        fit = calibrate_camera([stars], [None], given, catalogue, atmosphere, known={0: found}, site=place)
+    except (CalibrationError, InstrumentError):
+        return False
+    return confirms_hour(fit.lean_rad, fit.lean_sigma_rad)
 
 
 # Rounds in which one frame's stars are identified again with the lens found so far, and the significance of a k1 to use.

@@ -24,6 +24,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, PlaceError, StarposError
 from starpos.files import save
 from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn
+from starpos.fix.heading import confirms_hour
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame, Stars
@@ -40,6 +41,7 @@ from starpos.instrument.instrument import (
 )
 from starpos.instrument.tilt_log import TiltLog
 from starpos.night import horizon
+from starpos.night.extinction import light_of
 from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_inclinometer, of_left_out
@@ -288,7 +290,8 @@ def _watch(args: argparse.Namespace) -> int:
     answers, stars = [], []
     for item, sight, camera in inputs.seen_at(args, site):
         sky = sky_mag(item, sight.stars, sight.solution, camera) if isinstance(item, Frame) else np.nan
-        answers.append(Answer(solution=sight.solution, focal_px=camera.fx, sky_mag=sky))
+        light = light_of(sight.stars, sight.solution, camera)
+        answers.append(Answer(solution=sight.solution, focal_px=camera.fx, light=light, sky_mag=sky))
         if args.horizon is not None:
             stars.append(horizon.expected(sight, camera, catalogue.load_catalogue()))
     nights = kept(night_poses(answers, site.longitude))
@@ -300,7 +303,10 @@ def _watch(args: argparse.Namespace) -> int:
     if args.page is not None:
         watch_output.write_page(Path(args.page), nights)
     if stars:
-        horizon.write(Path(args.horizon), horizon.horizon(stars))
+        known = [n.pose.extinction for n in nights if np.isfinite(n.pose.extinction)]
+        horizon.write(
+            Path(args.horizon), horizon.horizon(stars, float(np.median(known)) if known else np.nan)
+        )
     return NOTHING if not nights or any(n.alarm for n in nights) else 0
 
 
@@ -495,6 +501,10 @@ def _about(found: FromSky) -> str:
         lines.append(
             f"refraction shows the zenith {lean:.2f} +- {sigma:.2f} deg from where time and place put it"
         )
+        if not confirms_hour(found.lean_rad, found.lean_sigma_rad):
+            lines.append(
+                "so the stars do not show whether the hour is right: the pose depends on the stated time"
+            )
     return "\n".join(lines) + "\n"
 
 

@@ -2,7 +2,6 @@
 """`starpos navigate`: place, heading and velocity of a voyage from its frames and an IMU, without standing still."""
 
 import argparse
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -37,11 +36,6 @@ COLUMNS = ("file", "status", *(k for k in KEYS if not k.startswith("covariance")
 
 def run(args: argparse.Namespace) -> int:
     args.frames = inputs.frames_among(args.frames, args.imu, args.velocity)
-    if args.velocity is not None and not args.drift_stddev and not math.isnan(args.drift_change):
-        raise VoyageError(
-            "--drift-change: a --velocity over ground drifts with nothing; give --drift-stddev if it is through water or "
-            "air"
-        )
     vertical, read, number = options.vertical_of(args), inputs.reader_of(args), len(args.frames)
     records = under_way.Records(
         imu=args.imu,
@@ -50,7 +44,6 @@ def run(args: argparse.Namespace) -> int:
         vehicle=args.vehicle,
         mount_stddev_deg=args.mount_stddev,
         drift_stddev=args.drift_stddev,
-        drift_change=args.drift_change,
         height_m=args.altitude_m,
     )
     with inputs.workers_of(args, args.frames) as workers:

@@ -21,6 +21,8 @@ COLUMNS = {
     "sigma_arcsec": ("1 sigma", "{:.1f}"),
     "focal_px": ("focal length, px", "{:.3f}"),
     "limit_mag": ("limit, V", "{:.1f}"),
+    "extinction": ("extinction, mag per air mass", "{:.2f}"),
+    "extinction_sigma": ("1 sigma", "{:.2f}"),
     "sky_mag": ("sky, V per square arcsec", "{:.2f}"),
     "alarm": ("", "{}"),
 }
@@ -42,6 +44,8 @@ def values_of(night: Kept) -> dict:
         "turned_arcsec": (night.turned / ARCSEC).tolist(),
         "focal_px": pose.focal_px,
         "limit_mag": pose.limit_mag,
+        "extinction": pose.extinction,
+        "extinction_sigma": pose.extinction_sigma,
         "sky_mag": pose.sky_mag,
         "alarm": night.alarm,
     }
@@ -50,9 +54,13 @@ def values_of(night: Kept) -> dict:
 def line_of(values: dict) -> str:
     """Text of a night for people."""
     sky = "" if math.isnan(values["sky_mag"]) else ", sky V {sky_mag:.2f} per square arcsec"
+    known = not math.isnan(values["extinction"])
+    air = ", extinction " + (
+        "{extinction:.2f} +- {extinction_sigma:.2f} mag per air mass" if known else "unknown"
+    )
     return (
         "{night}: {frames} frames, {stars} stars, moved by {moved_arcsec:.1f} +- {sigma_arcsec:.1f} arcsec, focal length "
-        "{focal_px:.3f} px, limit V {limit_mag:.1f}" + sky
+        "{focal_px:.3f} px, limit V {limit_mag:.1f}" + air + sky
     ).format(**values)
 
 
@@ -76,7 +84,7 @@ def write_page(path: Path, nights: Sequence[Kept]) -> None:
     )
     cells = [
         [
-            escape(("moved" if r[k] else "") if k == "alarm" else form.format(r[k]))
+            escape(("moved" if r[k] else "") if k == "alarm" else form.format(r[k]).replace("nan", "unknown"))
             for k, (_, form) in COLUMNS.items()
         ]
         for r in rows

@@ -304,17 +304,10 @@ cdef int _check_field(const double[:, ::1] field, const double[:, ::1] own) exce
     return 0
 
 
-def fit_field(const double[:, ::1] field, const double[:, ::1] own):
-    """Coefficients (6, V) of monomials, field (N, 6), that fit values (N, V) best, or None if nothing does."""
-    cdef Py_ssize_t k
-    _check_field(field, own)
-    out = np.empty((MONOMIALS, own.shape[1]))
-    cdef double[::1] weight = np.ones(max(field.shape[0], 1))
-    return out if _fit_field(field, own, &weight[0], out) else None
-
-
 def fit_field_robustly(const double[:, ::1] field, const double[:, ::1] own, const double[::1] weight, double outlying, int least, int rounds):
-    """Coefficients as in `fit_field`, with weights (N,), of the rows that agree: none is so many times farther off than the median.
+    """Coefficients (6, V) of monomials, field (N, 6), that fit values (N, V) best, with weights (N,), of the rows that agree.
+
+    None of these is so many times farther off than the median.
 
     Returns also chi-square of their weighted mean and of the fit, and how many they are; None if fewer than the least.
     """

@@ -245,20 +245,6 @@ def compare_with_pixel(
     return sums_[0], sums_[1], counts_[0], counts_[1]
 
 
-def count_marked(const unsigned char[:, :, ::1] mark):
-    """How many pixels of each stamp (N, S, S) are marked: (N,)."""
-    cdef Py_ssize_t n = mark.shape[0], area = mark.shape[1] * mark.shape[2], k, j
-    cdef int count
-    out = np.empty(n, np.intp)
-    cdef Py_ssize_t[::1] number = out
-    for k in range(n):
-        count = 0
-        for j in range(area):
-            count += (&mark[k, 0, 0])[j] != 0
-        number[k] = count
-    return out
-
-
 def brightest_left(
     const float[:, :, ::1] residual, const unsigned char[:, :, ::1] good, const double[::1] left, const double[::1] top,
     const double[:, :, ::1] axes, double nearest, double widths, const double[::1] weight,

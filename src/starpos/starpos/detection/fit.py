@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from starpos.detection._fit import Rules, fit_stamps
-from starpos.detection._vetting import brightest_left, count_marked
-from starpos.detection.psf import FieldPsf
+from starpos.detection._vetting import brightest_left
+from starpos.detection.psf import Psf
 from starpos.detection.stamps import Stamps, StarRows, joined
 
 # Sigmas above the model, and that share of the star's brightest pixel, from which a pixel is not the star's alone.
@@ -67,7 +67,7 @@ class Fit(StarRows):
     chi2              (N,) per degree of freedom
     pixels            (N,) how many pixels took part in the fit
     residual          (N, S, S) DN: signal minus model
-    model             (N, S, S) DN; 0 beyond FIT_WIDTHS, unless the whole is asked for
+    model             (N, S, S) DN; of a pair; else 0 beyond FIT_WIDTHS
     used              (N, S, S) bool: pixels that took part in the fit
     outlier           (N, S, S) bool: pixels left out because they are much too bright for this star
     leverage          (N, S, S), 0..1: a residual's variance is (1 - leverage) times the noise's; empty if not
@@ -97,17 +97,16 @@ COLUMNS = {
 
 def fit_stars(
     stamps: Stamps,
-    psf: FieldPsf,
+    psf: Psf,
     x: np.ndarray,
     y: np.ndarray,
     response: Response,
     rounds: int = 5,
     leverage: bool = False,
-    whole: bool = False,
 ) -> Fit:
     """Fit stars by Gauss-Newton, starting at the points x, y (N,) px.
 
-    The leverage of pixels and the model of the whole stamp are returned if asked for.
+    The leverage of pixels is returned if asked for.
 
     On a mosaic nothing is interpolated: each pixel is compared with the PSF at its own place, times the gain of its
     colour. Each star's four gains are fitted too, held near the frame's by colour_spread, so that neither the mosaic's
@@ -115,11 +114,11 @@ def fit_stars(
     the fit.
     """
     first = np.ascontiguousarray(x)[None], np.ascontiguousarray(y)[None]
-    return _fit(stamps, psf, *first, response, rounds, leverage, whole)[0]
+    return _fit(stamps, psf, *first, response, rounds, leverage, False)[0]
 
 
 def fit_pairs(
-    stamps: Stamps, psf: FieldPsf, places: np.ndarray, flux: np.ndarray, response: Response
+    stamps: Stamps, psf: Psf, places: np.ndarray, flux: np.ndarray, response: Response
 ) -> list[Fit]:
     """Fit a pair of stars to each of N stamps by Gauss-Newton on all their parameters.
 
@@ -134,7 +133,7 @@ def fit_pairs(
 
 
 def _fit(
-    stamps: Stamps, psf: FieldPsf, x: np.ndarray, y: np.ndarray, response: Response, *settings: object
+    stamps: Stamps, psf: Psf, x: np.ndarray, y: np.ndarray, response: Response, *settings: object
 ) -> list[Fit]:
     """Fits of K stars to each of N stamps, with first places x, y (K, N) px."""
     local = psf.at(x[0], y[0])
@@ -173,7 +172,7 @@ SMOOTHING /= 2 * SMOOTHING.sum() - SMOOTHING[0]
 def split_pairs(
     stamps: Stamps,
     alone: Fit,
-    psf: FieldPsf,
+    psf: Psf,
     response: Response,
     cut_at: Callable[[np.ndarray, np.ndarray], Stamps],
 ) -> tuple[np.ndarray, tuple[Stamps, Fit] | None]:
@@ -207,7 +206,7 @@ def split_pairs(
 
 
 def _are_real(
-    stamps: Stamps, alone: Fit, first: Fit, second: Fit, psf: FieldPsf, response: Response
+    stamps: Stamps, alone: Fit, first: Fit, second: Fit, psf: Psf, response: Response
 ) -> np.ndarray:
     """Which of N stars, fitted alone and then with companions, have these, (N,) bool."""
     way = np.stack([second.x - first.x, second.y - first.y], 1)[..., None]
@@ -231,19 +230,19 @@ def _off_centre_px(stamps: Stamps, fit: Fit) -> np.ndarray:
 
 def surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
     """Whether stars (N,) leave more light unexplained than a single star does."""
-    freedom = np.maximum(fit.pixels - 3, 1)
+    freedom, outliers = np.maximum(fit.pixels - 3, 1), np.count_nonzero(fit.outlier, axis=(1, 2))
     with np.errstate(invalid="ignore"):
-        odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (count_marked(fit.outlier) > 2)
-    return odd & (count_marked(stamps.full) == 0) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
+        odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (outliers > 2)
+    return odd & ~stamps.full.any((1, 2)) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
 
 
-def _model_light(stamps: Stamps, psf: FieldPsf, fit: Fit) -> np.ndarray:
+def _model_light(stamps: Stamps, psf: Psf, fit: Fit) -> np.ndarray:
     """The light (N, S, S) float32, DN, of fitted stars on whole stamps."""
     light = psf.at(fit.x, fit.y).evaluate(*stamps.corner(fit.x, fit.y), stamps.size)
     return light * (gains_at(fit.gains, stamps.phase) * fit.flux.astype(np.float32)[:, None, None])
 
 
-def _first_places(stamps: Stamps, fit: Fit, psf: FieldPsf) -> np.ndarray:
+def _first_places(stamps: Stamps, fit: Fit, psf: Psf) -> np.ndarray:
     """First places (2, 2, N) px of pairs: the star's, and the pixel off its centre where its fit leaves most light."""
     row, column = brightest_left(
         fit.residual,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learn a frame's PSF, colour gains and photon noise from its own bright stars, or along a known trail."""
+"""Learn a frame's PSF, colour gains and photon noise from its own bright stars."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,7 +10,6 @@ from scipy import spatial
 
 from starpos.detection._learn import (
     choose_terms,
-    fit_field,
     fit_field_robustly,
     light_noise,
     marginal_equations,
@@ -25,7 +24,7 @@ from starpos.detection._pixels import smooth_mosaic
 from starpos.detection._sky import median, quantile
 from starpos.detection.background import SkyPlane
 from starpos.detection.fit import Fit, Response, fit_stars
-from starpos.detection.psf import BROAD, MONOMIALS, NARROW, FieldPsf, Psf, gaussian, power, trailed
+from starpos.detection.psf import BROAD, MONOMIALS, NARROW, Psf, gaussian, power
 from starpos.detection.stamps import (
     FARTHEST,
     NARROWEST,
@@ -38,7 +37,6 @@ from starpos.detection.stamps import (
     relative_widths,
     window_for,
 )
-from starpos.frames.exposure import Trail
 
 # Minimum number of stars for a variation over the field,
 PLACES = 12
@@ -181,9 +179,7 @@ def _absorbed(psf: Psf, field: np.ndarray, terms: Terms, found: np.ndarray) -> t
     a, b, c = varied @ field[:, 1:].T
     change = np.stack([1 + np.sqrt(2) * a, b, b, 1 + np.sqrt(2) * c], -1).reshape(-1, 2, 2)
     root = power(np.tensordot(field[:, : len(psf.widths)], psf.widths, 1), 0.5)
-    widths = fit_field(field, (root @ change @ root).reshape(-1, 4))
-    if widths is None:
-        return psf, found
+    widths = np.linalg.lstsq(field, (root @ change @ root).reshape(-1, 4), rcond=None)[0]
     found = found.copy()
     found[terms.second, 1:] = 0
     return psf.with_widths(widths.reshape(-1, 2, 2)), found
@@ -229,15 +225,11 @@ SMOOTHING_WIDTH = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """A frame's PSF and response, and the distance from a star (px) out to which its light is used.
+    """A frame's PSF and response, and the distance from a star (px) out to which its light is used."""
 
-    teachers: how many stars have taught them.
-    """
-
-    psf: FieldPsf
+    psf: Psf
     response: Response
     reach: int
-    teachers: int
 
 
 def learn(
@@ -249,7 +241,6 @@ def learn(
     """Learn from the peaks x, y (N,) int px and their height (N,), highest first; defaults where they teach nothing."""
     response = Response(np.ones(len(sky.level)), 0.3, 0.0, 0.0)
     psf, stamps, x, y = _teachers(sky, x, y, height)
-    teachers = len(x)
     fine = sky.is_mosaic and psf.fwhm_px < FINE_FWHM and len(x) >= FINE_STARS
     rounds = ROUNDS + FINE_ROUNDS * fine
     for round_ in range(rounds + RING_ROUNDS):
@@ -277,7 +268,7 @@ def learn(
         else:
             terms = even_terms(elongation(psf), RING_ORDER if ring else ORDER)
         psf = refine(psf, stamps, fit, response, terms)
-    return Lesson(psf, response, reach_of(psf), teachers)
+    return Lesson(psf, response, reach_of(psf))
 
 
 def _teachers(
@@ -392,7 +383,7 @@ def _most_alike(light: np.ndarray) -> np.ndarray:
     return sound & (np.linalg.norm(look - look[sound][densest], axis=1) < LIKENESS)
 
 
-def reach_of(psf: FieldPsf) -> int:
+def reach_of(psf: Psf) -> int:
     """Distance from a star's centre, px, at which its stamp ends: 3.5 widths of the widest star in the field."""
     return min(max(math.ceil(3.5 * math.sqrt(psf.widest_px2())) + 1, 4), MAX_REACH)
 
@@ -414,7 +405,7 @@ def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndar
     return alone, high
 
 
-def respond(stamps: Stamps, psf: FieldPsf, fit: Fit, before: Response) -> Response:
+def respond(stamps: Stamps, psf: Psf, fit: Fit, before: Response) -> Response:
     """The Response of the fitted stars: gains of the phases, their scatter, and the noise that grows with light."""
     gain, spread = before.gain, before.colour_spread
     if len(gain) > 1:
@@ -437,69 +428,3 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
     )  # fmt: skip
     gain, spread = typical_gains(own, information, DARKEST_MEAN, MIN_GAIN, OUTLYING_GAIN, GAIN_ROUNDS)
     return gain, float(np.clip(spread, *SPREADS))
-
-
-# px; a shorter trail makes no star longer
-SHORTEST_PX = 1.0
-# A long star has its peaks off its middle: a fit from there takes longer.
-TRAIL_ROUNDS = 10
-# Where trails differ over the frame the highest peaks belong to the shortest: factor by which more peaks are looked at.
-MORE = 4
-# Factors by which the width is sought further, after the usual ones.
-FINER = 2**0.5, 2**0.25
-# Unknowns of a learnt Gaussian; minimum decrease of chi-square against a width that is not learnt from stars.
-OF_SHAPE, CLEAR = 3, 10.0
-
-
-def with_trail(
-    lesson: Lesson,
-    sky: SkyPlane,
-    x: np.ndarray,
-    y: np.ndarray,
-    trail: Trail,
-) -> Lesson:
-    """The Lesson with a PSF along a Trail where fewer than ALIKE stars have taught, and it fits no worse.
-
-    Where the camera rolled, so that each star has its own trail, also where more have taught, and it fits better.
-    x, y (N,) int px: the peaks, highest first.  Across the trail it is as wide as fits best.  What few stars have taught
-    may fit better by as much as its own unknowns are worth.
-    """
-    size = sky.width, sky.height
-    differ = trail.varies_px(*size) > SHORTEST_PX
-    taught = lesson.teachers >= ALIKE
-    if not differ and (taught or np.hypot(*trail.middle_px) < SHORTEST_PX):
-        return lesson
-    few = FEW * MORE if differ else FEW
-    peaks = np.flatnonzero(~are_dots(sky, x[: 10 * few], y[: 10 * few]))[:few]
-    own = float(np.sqrt(np.linalg.eigvalsh(lesson.psf.shape)[0]))
-    tried = [trailed(sigma, trail, *size) for sigma in (own, *USUAL_SIGMAS)]
-    stamps = cut(sky, x[peaks], y[peaks], max(map(reach_of, (lesson.psf, *tried))))
-
-    def fitted(psf: FieldPsf) -> Fit:
-        start = stamps.x.astype(float), stamps.y.astype(float)
-        return fit_stars(stamps, psf, *start, lesson.response, TRAIL_ROUNDS, leverage=True, whole=True)
-
-    fits = [fitted(lesson.psf), *map(fitted, tried)]
-    for factor in FINER:
-        best = tried[int(np.argmin(_chi_squares(stamps, fits, lesson)[1:]))]
-        finer = [trailed(best.sigma * f, trail, *size) for f in (factor, 1 / factor)]
-        tried, fits = tried + finer, fits + [fitted(psf) for psf in finer]
-    left = _chi_squares(stamps, fits, lesson)
-    best_of = int(np.argmin(left[1:]))
-    unknowns = OF_SHAPE + np.count_nonzero(lesson.psf.at(x[:1].astype(float), y[:1].astype(float)).series) - 1
-    allowed = 0.0 if taught else WORTH * unknowns if lesson.teachers else -CLEAR
-    # 0 of no stamp
-    if not (left[0] > 0 and left[1 + best_of] < left[0] + allowed):
-        return lesson
-    psf, fit, response = tried[best_of], fits[1 + best_of], lesson.response
-    sound = (fit.flux > BRIGHT * fit.flux_sigma) & np.isfinite(fit.covariance).all((1, 2))
-    if sound.any():
-        response = respond(stamps.select(sound), psf, fit.select(sound), response)
-    return replace(lesson, psf=psf, response=response, reach=reach_of(psf))
-
-
-def _chi_squares(stamps: Stamps, fits: list[Fit], lesson: Lesson) -> np.ndarray:
-    """Chi-square that fits with different PSFs leave in the same stamps, by the noise of the first one's light."""
-    noise2 = lesson.response.variance(stamps.noise, fits[0].model)
-    left = np.array([(stamps.good * fit.residual**2 / noise2).sum((1, 2)) for fit in fits])
-    return left[:, np.isfinite(left).all(0)].sum(1)

@@ -16,11 +16,11 @@ from starpos.detection._pixels import third_highest
 from starpos.detection.background import halved, measure_sky, plane_of, window_of
 from starpos.detection.discs import find_disc
 from starpos.detection.finding import find_peaks, find_streaks
-from starpos.detection.learn import learn, with_trail
+from starpos.detection.learn import learn
 from starpos.detection.saturated import find_discs, with_clipped, with_discs
 from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
-from starpos.frames.exposure import Exposure, Trail
+from starpos.frames.exposure import Exposure
 from starpos.frames.frame import BLENDED, COLUMNS, EDGE, ELONGATED, Frame, Stars, Window, no_stars
 
 # Pixels of stars that are fitted together, give or take half, on a small and on a large frame: about 2 and 6 MB.
@@ -126,7 +126,6 @@ class _Picture:
     plane     (h, w) of a frame, or of a reduced one; halvings: how often it may be reduced by two
     mosaic    whether its pixels are of several colours
     exposure  of the frame
-    trail     how stars move during the exposure; None if not stated
     """
 
     plane: np.ndarray
@@ -134,7 +133,6 @@ class _Picture:
     settings: DetectionSettings
     exposure: Exposure
     halvings: int
-    trail: Trail | None
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -154,7 +152,6 @@ class _Picture:
             mosaic=False,
             settings=settings,
             halvings=self.halvings - 1,
-            trail=None if self.trail is None else self.trail.halved(),
         )
         return smaller, gain
 
@@ -188,7 +185,6 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
         settings=settings,
         exposure=frame,
         halvings=MAX_HALVINGS,
-        trail=frame.trail,
     )
     found = _detect(picture)
     return replace(found, stars=replace(found.stars, disc=find_disc(plane)))
@@ -250,8 +246,6 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     if streaks:
         sky = replace(sky, streaks=streaks)
     lesson = learn(sky, x, y, height)
-    if picture.trail is not None:
-        lesson = with_trail(lesson, sky, x, y, picture.trail)
     pixels = (2 * lesson.reach + 1) ** 2
     chunk = max(1, int(np.clip(plane.size // 32, *CHUNK_PIXELS)) // pixels)
     most = min(len(x), limit * (PIXELS_PER_PEAK >> MAX_HALVINGS - picture.halvings) // pixels)

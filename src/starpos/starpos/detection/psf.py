@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The frame's effective point spread function, learnt from its stars or drawn along a known trail."""
+"""The frame's effective point spread function, learnt from its stars."""
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.polynomial import hermite_e
 
 from starpos.detection._moments import clip_widths, squared_widths
 from starpos.detection._psf import evaluated, monomials, psf_at, shapes_of
-from starpos.frames.exposure import Trail
 
 # How many monomials describe a variation over the field: up to second order in x and y.
 MONOMIALS = 6
@@ -46,10 +43,21 @@ class LocalPsf:
         return evaluated(self.axes, self.series, left, top, size)
 
 
-class FieldPsf(ABC):
-    """The PSF of a frame; `at` gives it at the places of stars. axes (2, 2): the mean star's, as in LocalPsf."""
+@dataclass(frozen=True, eq=False)
+class Psf:
+    """The PSF of a frame; `at` gives it at the places of stars.
+
+    axes    (2, 2): the mean star's, as in LocalPsf
+    widths  (K, 2, 2): squared widths along these axes, as coefficients of K monomials of the field's coordinates; K is
+            6, or 1 if they are the same everywhere
+    series  (K, I, J): coefficients of the series, in the same way
+    box     (2, 2): lowest and highest x, y, px, of the stars it was learnt from; beyond, the PSF is as at its edge
+    """
 
     axes: np.ndarray
+    widths: np.ndarray
+    series: np.ndarray
+    box: np.ndarray
 
     @property
     def shape(self) -> np.ndarray:
@@ -62,35 +70,6 @@ class FieldPsf(ABC):
         """Geometric mean over the two axes of the mean star's full width at half maximum."""
         (a, b), (c, d) = self.axes.tolist()
         return math.sqrt(8 * math.log(2)) * abs(a * d - b * c) ** -0.5
-
-    @abstractmethod
-    def at(self, x: np.ndarray, y: np.ndarray) -> LocalPsf:
-        """The PSF at the points x, y (N,) px."""
-
-    @abstractmethod
-    def widest_px2(self) -> float:
-        """The largest squared width of a star in the field."""
-
-    @abstractmethod
-    def shapes_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Covariances (N, 2, 2) px2, or (1, 2, 2), of the Gaussians of the PSF at the points x, y (N,) px."""
-
-
-@dataclass(frozen=True, eq=False)
-class Psf(FieldPsf):
-    """The PSF as it is learnt.
-
-    axes    (2, 2)
-    widths  (K, 2, 2): squared widths along these axes, as coefficients of K monomials of the field's coordinates; K is
-            6, or 1 if they are the same everywhere
-    series  (K, I, J): coefficients of the series, in the same way
-    box     (2, 2): lowest and highest x, y, px, of the stars it was learnt from; beyond, the PSF is as at its edge
-    """
-
-    axes: np.ndarray
-    widths: np.ndarray
-    series: np.ndarray
-    box: np.ndarray
 
     def at(self, x: np.ndarray, y: np.ndarray) -> LocalPsf:
         """The PSF at the points x, y (N,) px."""
@@ -140,64 +119,3 @@ def gaussian(shape: np.ndarray, x: np.ndarray = ONE_PLACE, y: np.ndarray = ONE_P
 def power(widths: np.ndarray, exponent: float) -> np.ndarray:
     """Powers of the symmetric matrices of squared widths (N, 2, 2), with eigenvalues limited to NARROW..BROAD."""
     return clip_widths(widths, NARROW, BROAD, exponent)
-
-
-# of the series along the trail
-ORDER = 24
-
-
-@dataclass(frozen=True, eq=False)
-class TrailedPsf(FieldPsf):
-    """A round Gaussian of sigma px that moves evenly along its trail, on a frame of width by height px."""
-
-    axes: np.ndarray
-    sigma: float
-    trail: Trail
-    width: int
-    height: int
-
-    def at(self, x: np.ndarray, y: np.ndarray) -> LocalPsf:
-        """The PSF at the points x, y (N,) px.
-
-        The coefficient of h_i is its mean over the light: the mean of He_i / sqrt(i!) over +-sqrt(3), where an even
-        spread has a variance of 1, times the power i / 2 of the trail's share of the variance along it.
-        """
-        way = self.trail.at(x, y, self.width, self.height)
-        length = np.hypot(way[:, 0], way[:, 1])
-        along = np.where(length[:, None] > 0, way / np.maximum(length, 1e-9)[:, None], [1.0, 0.0])
-        drawn = length**2 / 12
-        axes = np.stack([along, np.stack([-along[:, 1], along[:, 0]], -1)], 1) / self.sigma
-        axes[:, 0] *= (self.sigma / np.sqrt(self.sigma**2 + drawn))[:, None]
-        series = np.zeros((len(x), ORDER + 1, 1))
-        series[:, EVEN, 0] = (drawn / (self.sigma**2 + drawn))[:, None] ** (EVEN / 2) * FLAT
-        return LocalPsf(axes, series)
-
-    def widest_px2(self) -> float:
-        """The largest squared width of a star on the frame, which is in a corner."""
-        x, y = (
-            np.array([0.0, 1.0, 0.0, 1.0]) * (self.width - 1),
-            np.array([0.0, 0.0, 1.0, 1.0]) * (self.height - 1),
-        )
-        return float(np.linalg.eigvalsh(self.shapes_at(x, y)).max())
-
-    def shapes_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Covariances (N, 2, 2) px2 of the Gaussians of the PSF at the points x, y (N,) px."""
-        way = self.trail.at(x, y, self.width, self.height)
-        return self.sigma**2 * np.eye(2) + way[:, :, None] * way[:, None, :] / 12
-
-
-def trailed(sigma: float, trail: Trail, width: int, height: int) -> TrailedPsf:
-    """The PSF of a round Gaussian of sigma px that moves along a trail."""
-    mean = gaussian(sigma**2 * np.eye(2) + trail.mean_square(width, height) / 12)
-    return TrailedPsf(mean.axes, sigma, trail, width, height)
-
-
-def _flat() -> np.ndarray:
-    """Coefficients of an even spread of variance 1, of the even orders."""
-    root = np.array([math.sqrt(3 * math.factorial(i)) for i in EVEN])
-    highest = hermite_e.hermeval(np.sqrt(3), np.eye(ORDER + 2)[:, EVEN + 1])
-    return np.asarray(highest / ((EVEN + 1) * root))
-
-
-EVEN = np.arange(0, ORDER + 1, 2)
-FLAT = _flat()

@@ -62,7 +62,7 @@ def other_views(frame: Frame, window: Window | None) -> Iterator[Stars]:
             continue
         if flat:
             reduced = _flattened(reduced if halvings or not mosaic else cv2.GaussianBlur(reduced, (3, 3), 0))
-        reduced_frame = replace(frame, pixels=reduced, pattern="", trail=None)
+        reduced_frame = replace(frame, pixels=reduced, pattern="")
         settings = DetectionSettings(mesh_px=MESH_PX) if flat else DetectionSettings()
         yield enlarged(detect(reduced_frame, settings).stars, 2**halvings, frame.width, frame.height, window)
 

@@ -18,7 +18,7 @@ from starpos.detection._vetting import (
 from starpos.detection.background import SkyPlane
 from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars, split_pairs, surprising
 from starpos.detection.learn import Lesson, grey
-from starpos.detection.psf import FieldPsf
+from starpos.detection.psf import Psf
 from starpos.detection.stamps import (
     RAISED,
     UNEVEN,
@@ -210,7 +210,7 @@ def _is_dot(stamps: Stamps, fit: Fit, response: Response) -> np.ndarray:
     return (one < star) & (likely | (one < 0.5 * star)) & (full < SPECK)
 
 
-def resolve(stars: np.ndarray, psf: FieldPsf) -> np.ndarray:
+def resolve(stars: np.ndarray, psf: Psf) -> np.ndarray:
     """Sort measured stars by flux, keep one of several fits of the same star, and flag close neighbours as BLENDED.
 
     A wide image is kept only if no better one was measured there.

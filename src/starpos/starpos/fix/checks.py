@@ -108,6 +108,11 @@ def _altitude_text(sine: float) -> str:
 # A trail of which this much more than the stars' width (times it, and px) is missing; and the smallest width of a trail
 # across, px, for which the detector's FWHM is the geometric mean of length and width.
 TRAIL_WIDTHS, TRAIL_PX, ACROSS_PX = 3.0, 3.0, 0.8
+# The same by the stars' shapes, where they are measured: a trail this many times as long as wide would be seen, and
+# shapes that are circles to this share are not measured.
+LONGER_THAN_WIDE, SHAPELESS = 1.5, 1e-6
+# (FWHM / length)^2 of the normal curve with a trail's variance
+TRAIL_VARIANCE = 8 * math.log(2) / 12
 
 
 def check_exposure(stars: Stars, camera: Camera, directions: np.ndarray) -> None:
@@ -119,13 +124,26 @@ def check_exposure(stars: Stars, camera: Camera, directions: np.ndarray) -> None
         return
     across_pole = math.sqrt(1 - float(np.mean(directions[:, 2] ** 2)))
     trail_px = ROTATION_RAD_S * stars.exposure_s * across_pole * camera.fx
-    if trail_px > max(TRAIL_WIDTHS * stars.fwhm_px + TRAIL_PX, stars.fwhm_px**2 / ACROSS_PX):
+    too_narrow = trail_px > max(TRAIL_WIDTHS * stars.fwhm_px + TRAIL_PX, stars.fwhm_px**2 / ACROSS_PX)
+    if too_narrow or _too_round(stars, trail_px):
         raise FixError(
             f"{stars.place}: its stars are points of {stars.fwhm_px:.1f} px (FWHM), and an exposure of "
             f"{stars.exposure_s:g} s of a camera at rest makes trails of {trail_px:.0f} px: its exposure time is wrong "
             "(milliseconds?), or it was tracked, added or stacked: give single frames of a camera at rest with their own "
             "times"
         )
+
+
+def _too_round(stars: Stars, trail_px: float) -> bool:
+    """Whether star images, whose errors along and across are as their widths, are far rounder than such trails are."""
+    small, large = np.linalg.eigvalsh(stars.covariance).T
+    if not len(small) or np.all(large < (1 + SHAPELESS) * small):
+        return False
+    longer = math.sqrt(float(np.median(large / small)))
+    # a trail's area is the measured one; along it the variances of star and trail add up
+    area, more = stars.fwhm_px**2, TRAIL_VARIANCE * trail_px**2
+    expected = area / (0.5 * (math.hypot(more, 2 * area) - more))
+    return expected > LONGER_THAN_WIDE and longer < math.sqrt(expected)
 
 
 # a camera at rest gets beyond it once in 900 frames

@@ -54,7 +54,7 @@ from starpos.identification.search import (
 from starpos.identification.triangles import TriangleCatalogue, cached_triangles
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.inclinometer import EITHER_WAY, Tilt
-from starpos.instrument.instrument import OWN_LEVEL, ByGravity, Instrument
+from starpos.instrument.instrument import FISHEYE_AXIS, OWN_LEVEL, UNKNOWN_CLOCK_S, ByGravity, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
@@ -111,13 +111,10 @@ def _aims(stars: Stars, field: FrameStars | fisheye.WideField) -> tuple[AimPrior
 # how stars are identified: the field, the sky, the camera
 _Search = Callable[[FrameStars | fisheye.WideField, Sky, Camera], Identification | None]
 
+HourByLens = Callable[[Stars, Identification, Camera, Catalogue, Atmosphere, Place], bool]
+
 ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 130.0
-
-
-# A fisheye of which only the focal length is known misplaces stars by about this, outwards: it cancels where they lie all
-# around, and not where a mask leaves one side.
-NOMINAL_LENS_RAD = 0.002
 
 
 @dataclass(frozen=True)
@@ -128,6 +125,8 @@ class Solver:
 
     catalogue: or the deeper one in its stead, for a field that needs it.
     ephemeris: of the Sun, the Moon and planets.
+    hour_by_lens: whether the stars of a fisheye's frame at a place show its hour, with a lens fitted to them alone; None
+        for stamps that are surely UTC, as of a node's camera.
 
     Examples
     --------
@@ -144,6 +143,7 @@ class Solver:
     min_stars: int = 5
     progress: Progress = quiet
     ephemeris: SolarSystem = ERFA
+    hour_by_lens: "HourByLens | None" = None
 
     def prepare(self, width: int, height: int, origin_px: tuple[float, float] | None = None) -> str:
         """Load the tables for frames of this size in px, or build them; raises StarposError.
@@ -372,14 +372,16 @@ class Solver:
         check_risen(stars, found, camera, sky, up)
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
         about = self.circumstances(stars, camera.scaled(found.focal_scale), state)
-        if fisheye.is_wide(camera) and not any(camera.distortion):
-            off = matched.xy - [camera.cx, camera.cy]
-            # how far they lie on one side of the axis, from 0 to 1
-            aside = float(np.hypot(*off.mean(0)) / max(np.hypot(*off.T).mean(), 1e-9))
-            lens = NOMINAL_LENS_RAD * aside
-            about = replace(about, axis_stddev=math.hypot(about.axis_stddev, lens))
+        uncalibrated = fisheye.is_wide(camera) and not any(camera.distortion)
+        if uncalibrated:
+            about = replace(about, axis_stddev=max(about.axis_stddev, FISHEYE_AXIS))
         attitude = attitude_at_place(matched, place, about)
         shown = attitude.hour_shown or self._hour_at_horizon(stars, found, camera, state, up)
+        if not shown and self.hour_by_lens is not None:
+            air = self.atmosphere
+            shown = uncalibrated and self.hour_by_lens(stars, found, about.camera, catalogue, air, place)
+            if not shown and about.clock_stddev_s == UNKNOWN_CLOCK_S:
+                attitude = attitude_at_place(matched, place, replace(about, clock_stddev_s=HOUR_S))
         return replace(attitude, used=np.flatnonzero(use)[attitude.used], hour_shown=shown)
 
     def _hour_at_horizon(
@@ -487,8 +489,9 @@ def check_explained(answer: Solution) -> None:
 
 
 UNSHOWN_HOUR = (
-    "nothing in the frame shows that its hour is right, and a wrong one turns the heading by degrees: state UTC, and "
-    "calibrate the camera with frames whose stars reach down to 10 deg of altitude"
+    "nothing in the frame shows that its hour is right, and a wrong one turns the heading by degrees: its error "
+    "holds for UTC within the clock's stated error, and where none is stated (--clock-stddev) it contains an "
+    "hour. Stars down to 10 deg of altitude show the hour"
 )
 
 # a correct place lies further from the stars' own once in 1e6 frames

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read frames from FITS files, or from the bytes of one that a camera's driver has sent."""
 
+import configparser
 import gzip
 import io
 import itertools
@@ -11,10 +12,12 @@ import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from starpos import files
 from starpos.errors import FrameError, one_line
 from starpos.frames.frame import MAX_BYTES, PATTERNS, Frame, check_pixels, to_unsigned
 from starpos.frames.header import KEYS, read_exposure
@@ -103,8 +106,10 @@ def _check_unpacked(size: int, place: str) -> None:
 
 
 # A stack of video frames as the Global Meteor Network's RMS writes it (FF files): maximum, its frame, mean and scatter of
-# each pixel. Its mean shows the stars; the number of frames over their rate is the exposure.
-STACK_KEYS, MEAN_OF_STACK = ("NFRAMES", "FPS", "CAMNO"), "AVEPIXEL"
+# each pixel. Its mean shows the stars; the number of frames over their rate is the exposure. The rate is in its header,
+# or in the station's configuration in the same folder.
+STACK_KEYS, MEAN_OF_STACK, RATE = ("NFRAMES", "CAMNO"), "AVEPIXEL", "FPS"
+CONFIG, MAX_CONFIG_BYTES = ".config", 1_000_000
 # the start of the first frame, UTC, is in its header, or in its name
 STACK_NAME = re.compile(
     r"FF_\w+?_(\d{4})(\d\d)(\d\d)_(\d\d)(\d\d)(\d\d)_(\d{3}|\d{6})_\d+\.fits?\b", re.ASCII
@@ -118,12 +123,24 @@ def _is_meteor_stack(primary: Mapping) -> bool:
 def _of_meteor_stack(header: Mapping, primary: Mapping, place: str) -> dict[str, Any]:
     """The header of a stack of video frames as the header of one exposure, as far as its times can be read."""
     made = {key: value for key, value in header.items() if key != "NFRAMES"}
-    with suppress(TypeError, ValueError, ZeroDivisionError):
-        made.setdefault("EXPTIME", float(primary["NFRAMES"]) / float(primary["FPS"]))
+    with suppress(OSError, TypeError, ValueError, LookupError, ZeroDivisionError, configparser.Error):
+        rate = primary[RATE] if RATE in primary else _config_beside(place)["Capture"][RATE]
+        made.setdefault("EXPTIME", float(primary["NFRAMES"]) / float(rate))
     if "DATE-OBS" not in made and (named := STACK_NAME.search(place)):
         year, month, day, hour, minute, second, part = named.groups()
         made["DATE-OBS"] = f"{year}-{month}-{day}T{hour}:{minute}:{second}.{part}"
     return made
+
+
+def rms_config(text: str) -> configparser.ConfigParser:
+    """A `.config` of RMS; configparser.Error for another file."""
+    parser = configparser.ConfigParser(inline_comment_prefixes=("#", ";"), interpolation=None, strict=False)
+    parser.read_string(text)
+    return parser
+
+
+def _config_beside(place: str) -> configparser.ConfigParser:
+    return rms_config(files.read_regular(Path(place).with_name(CONFIG), MAX_CONFIG_BYTES).decode())
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from starpos.errors import FrameError
-from starpos.frames.exposure import Exposure, Trail, check_size
+from starpos.frames.exposure import Exposure, check_size
 
 # Maximum bytes of a file, and of the pixels it unpacks to: both fit into a small robot's memory.
 MAX_BYTES = 800_000_000
@@ -39,7 +39,6 @@ class Frame(Exposure):
     ----------
     pixels : (height, width) uint8 or uint16, grey or a colour mosaic; or (height, width, 3) uint8, BGR
     pattern : the mosaic's colours in reading order: 'rggb', 'bggr', 'grbg', 'gbrg'; '' for none
-    trail : how its stars move during the exposure; None: unknown
 
     Examples
     --------
@@ -50,7 +49,6 @@ class Frame(Exposure):
 
     pixels: np.ndarray
     pattern: str = ""
-    trail: Trail | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

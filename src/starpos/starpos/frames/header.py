@@ -26,30 +26,31 @@ START, MIDDLE, END = (
     ("DATE-END", "MJD-END"),
 )
 # UTC of the start, where DATE-OBS or DATE-BEG is a day alone
-HOURS = ("TIME-OBS", "UT", "UTSTART", "UTC", "UTC-OBS", "UT-OBS", "UTSHUT")
-# Other cards with the UTC of some moment of the exposure, which have to agree with those above: dates as text or numbers
-DATES = (
-    "DATE-UTC",
-    "DATE_UTC",
-    "DATE-GPS",
-    "JD",
-    "JD-OBS",
-    "JD_UTC",
-    "JD-UTC",
-    "JUL-DATE",
-    "EXPSTART",
-    "UNIXTIME",
+HOURS = (
+    "TIME-OBS",
+    "TIME-BEG",
+    "UT",
+    "UTSTART",
+    "UT-START",
+    "UTCSTART",
+    "UTC",
+    "UTC-OBS",
+    "UT-OBS",
+    "UTSHUT",
 )
+# Other cards with the UTC of some moment of the exposure, which have to agree with those above: dates as text or numbers
+DATES = ("DATE-UTC", "DATE_UTC", "DATE-GPS", "GPS-UTC", "GPS-TIME", "GPSTIME", "JD", "JD-OBS", "OBS-JD", "OBSJD",
+         "JD_UTC", "JD-UTC", "JDSTART", "JUL-DATE", "MJD", "MJD_OBS", "EXPSTART", "UNIXTIME")  # fmt: skip
 # a local time, and its zone: they show whether DATE-OBS is the local one
 LOCAL, ZONES = ("DATE-LOC", "DATE-LT", "LOCTIME", "LOCALTIM"), ("TIMEZONE", "TZ", "TIMEZ")
 # lengths in s: of one exposure (EXP: DWARF), then of all together (LIVETIME: Siril, TOTALEXP: Seestar)
 LENGTHS = ("EXPTIME", "EXPOSURE", "XPOSURE", "EXP", "LIVETIME", "TOTALEXP")
 # number of stacked exposures (Seestar and Siril, IRAF, MaxIm, infrared cameras, Astro Pixel Processor and others)
 COUNTS = ("STACKCNT", "NCOMBINE", "SNAPSHOT", "COADDS", "COADD", "NCOADD", "NCOADDS", "NFRAMES", "NSTACK", "NSTACKED",
-          "LIGH_CNT", "LUM_CNT")  # fmt: skip
+          "LIGH_CNT", "LUM_CNT", "NSUBEXP")  # fmt: skip
 # the second of a stack's inputs (IRAF); the kind of a frame
 SECOND_INPUT, KIND = "IMCMB002", "IMAGETYP"
-STACKED = re.compile(r"\b(master|stack(ed)?|integration|co-?add(ed)?|sum(med)?)\b", re.IGNORECASE)
+STACKED = re.compile(r"\b(master *(light)?|stack(ed)?|integration|co-?add(ed)?|sum(med)?)\b", re.IGNORECASE)
 TIME_KEYS = (
     *START,
     *MIDDLE,
@@ -77,12 +78,14 @@ OFFSET = re.compile(r"\b(?:utc?|gmt) *[+-] *0*[1-9]", re.IGNORECASE)
 ZONE = re.compile(
     r"\b(CES?T|MES?Z|EES?T|WEST|BST|MSK|[ECMP][SD]T|AK[SD]T|HST|[IJK]ST|A[ECW][SD]T|NZ[SD]T|SAST|BRT|ART|CLS?T)\b"
 )
-LOCALLY = re.compile(r"\blocal\b", re.IGNORECASE)
+LOCALLY = re.compile(r"\b(local|civil|wall.?clock)\b", re.IGNORECASE)
 OPENING = re.compile(r"\b(start|begin|beginning|open(ing)?)\b", re.IGNORECASE)
 CENTRE = re.compile(r"\b(mid|middle|midpoint|cent(er|re))\b", re.IGNORECASE)
-CLOSING = re.compile(r"\b(end|ending|finish|stop|close|closing|frame grabbed)\b", re.IGNORECASE)
+CLOSING = re.compile(r"\b(end|ending|finish|stop|closed?|closing|frame grabbed)\b", re.IGNORECASE)
 CREATED = re.compile(r"\b(image created|file (created|written))\b", re.IGNORECASE)
-GPS = re.compile(r"\bgps\b", re.IGNORECASE)
+# ahead of UTC
+OTHER_SCALE_S = {"GPS": 18, "TAI": 37, "TT": 69}
+OTHER_SCALE = re.compile(r"\b(GPS|TAI|TT)\b", re.IGNORECASE)
 # Cards of the UTC of some moment of the exposure may be off by the time in which a header is written. Up to FOUND_S the
 # difference is an error of the stamp; a larger one is another time, as a local one is.
 WRITING_S, FOUND_S = 5.0, 90.0
@@ -94,8 +97,9 @@ ISO_TIME = re.compile(r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d)(?::(\d\d?(?:\.\d*)?)
 DAY = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
 MJD_ZERO_JD, FARTHEST_MJD = 2400000.5, 1e7
 CLOCK = re.compile(r"(\d\d?):(\d\d)(?::(\d\d(?:\.\d*)?))?", re.ASCII)
-# numbers above these are MJDs of the space age, Julian dates, Unix times of this century
-LEAST_MJD, LEAST_JD, LEAST_UNIX_S = 3e4, 2e6, 9e8
+# numbers above these are MJDs of the space age, Julian dates, Unix times of this century; a number of GPS counts from an
+# epoch of its own, or a week's
+LEAST_MJD, MOST_MJD, LEAST_JD, LEAST_UNIX_S = 3e4, 1e5, 2.43e6, 9e8
 # smallest step of an MJD's last digit: below it lie the last bits of a double
 MIN_MJD_STEP_S = 1e-3
 # Cards with the column and row of the sensor's frame at which a frame begins, in pixels of this frame, and their sign:
@@ -317,10 +321,12 @@ def _as_commented(header: Mapping, comments: Mapping[str, str]) -> Mapping:
                 f"its {key} is when the file was made by its comment ({one_line(comment)}): write the start of the "
                 "exposure into it"
             )
-        if GPS.search(comment) and not UNIVERSAL.search(comment) and not values.get("TIMESYS"):
+        scale = OTHER_SCALE.search(comment)
+        if scale and not UNIVERSAL.search(comment) and not values.get("TIMESYS"):
+            name = scale[1].upper()
             raise TimeError(
-                f"its {key} may be GPS time by its comment ({one_line(comment)}), 18 s ahead of UTC: add a card TIMESYS "
-                "with GPS or UTC"
+                f"its {key} may be {name} time by its comment ({one_line(comment)}), {OTHER_SCALE_S[name]} s ahead of "
+                f"UTC: add a card TIMESYS with {name} or UTC"
             )
         if OPENING.search(comment):
             continue
@@ -377,13 +383,13 @@ def _other_unix_s(header: Mapping, key: str, near_unix_s: float) -> tuple[float,
     except (TypeError, ValueError, OverflowError, erfa.ErfaError):
         return None
     # a Unix time, a Julian date or an MJD, by its size
-    if key not in DATES or not math.isfinite(number):
+    if key not in DATES or key.startswith("GPS") or not math.isfinite(number):
         return None
     if number > LEAST_UNIX_S:
         return number, 1.0
-    zero_jd = UNIX_EPOCH_JD if number > LEAST_JD else UNIX_EPOCH_JD - MJD_ZERO_JD
-    if not number > LEAST_MJD:
+    if not (LEAST_MJD < number < MOST_MJD or LEAST_JD < number < LEAST_JD + MOST_MJD):
         return None
+    zero_jd = UNIX_EPOCH_JD if number > LEAST_JD else UNIX_EPOCH_JD - MJD_ZERO_JD
     return (number - zero_jd) * DAY_S, math.sqrt(3) * _rounding(number) + 1.0
 
 

@@ -13,7 +13,7 @@ from starpos import rotation
 from starpos.errors import InstrumentError, TiltError
 from starpos.frames.exposure import Exposure, Shutter
 from starpos.frames.gravity import contradicts
-from starpos.instrument.camera import PLUMB_BOB, Camera
+from starpos.instrument.camera import EQUIDISTANT, PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Mounting
 from starpos.instrument.sensors import built_in_rad, find, is_built_in, unnamed
@@ -447,9 +447,10 @@ class Instrument:
         if self.size is None:
             return _ideal(width, height, self.focal_px, self.model)
         whole = self.camera or _ideal(*self.size, self.focal_px, self.model)
-        if origin_px is None and self.size == (width, height):
-            return whole
         left, top = origin_px or (math.nan, math.nan)
+        # an unstated part of just this size: the camera was calibrated with pictures that are cut out alike
+        if math.isnan(left + top) and self.size == (width, height):
+            return whole
         if not (0 <= left <= whole.width - width and 0 <= top <= whole.height - height):
             where = "" if math.isnan(left + top) else f" at column {left:g}, row {top:g}"
             what = "focal length and A3 are" if self.camera is None else "the camera's intrinsics are"
@@ -462,7 +463,7 @@ class Instrument:
 
     def whole_of(self, camera: Camera, origin_px: tuple[float, float] | None) -> Camera:
         """The camera of the whole frame from the camera of a part which begins at a column and row, if both are known."""
-        if self.size is None or origin_px is None:
+        if self.size is None or origin_px is None or math.isnan(sum(origin_px)):
             return camera
         return camera.part(-origin_px[0], -origin_px[1], *self.size)
 
@@ -504,6 +505,9 @@ STANDARD_SIZES = {(320, 240), (640, 480), (800, 600), (1024, 768), (1280, 720), 
 # 1 sigma of the axis from a frame's centre if the frame's part of the sensor is unknown: its longer side, and at least
 # this, as most sensors have up to 7000 px
 MIN_UNKNOWN_PX = 2000.0
+# 1 sigma, in focal lengths, along x and y, of a fisheye's axis from a frame's centre, as of three real cameras; with an
+# axis much further off its stars do not fit an ideal lens
+FISHEYE_AXIS = 0.04
 SIZE_IN_FILE = "camera: {focal_mm, pixel_um, width, height} in the instrument file"
 
 
@@ -575,6 +579,8 @@ def framed(instrument: Instrument, first: Framed) -> tuple[Instrument, AxisDoubt
     else:
         why = f"these frames of {width} x {height} px are cut out of larger ones at an unstated position"
     error_px = max(longer, MIN_UNKNOWN_PX)
+    if instrument.model == EQUIDISTANT:
+        error_px = min(error_px, FISHEYE_AXIS * instrument.focal_px)
     return instrument, AxisDoubt(why, error_px, math.atan(error_px / instrument.focal_px))
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from starpos import files, rotation
 from starpos.errors import InstrumentError
+from starpos.frames.fits import rms_config
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.instrument import Instrument
 from starpos.units import DAY_S
@@ -63,8 +64,7 @@ def read(path: Path | str) -> RmsCamera:
 
 
 def _of_config(text: str) -> RmsCamera:
-    parser = configparser.ConfigParser(inline_comment_prefixes=("#", ";"), interpolation=None, strict=False)
-    parser.read_string(text)
+    parser = rms_config(text)
     place, capture = parser["System"], parser["Capture"]
     width, height, fov_deg = (float(capture[k]) for k in ("width", "height", "fov_w"))
     camera = Camera.from_focal(int(width), int(height), float(width / np.radians(fov_deg)), EQUIDISTANT)

@@ -36,11 +36,8 @@ USUAL_GAPS = 2.5
 OPEN_END = 0.25
 # Half of an exposure with a margin for rounded times; number of readings that determine their usual interval.
 HALF, MIN_TIMES = 0.6, 5
-# Number of equal readings in a row that show a stuck sensor, as in the node, if equal neighbours are rare elsewhere: at
-# 0.1, chance makes one such row in 10^9 readings.
-STUCK_READINGS, RARE = 10, 0.1
-# a sensor whose readings repeat this often is coarse, or quiet
-MOSTLY_STUCK = 2.0
+# Number of equal readings in a row that may show a stuck sensor, as in the node.
+STUCK_READINGS = 10
 # Steps, deg, in which loggers round.
 ROUNDED_DEG = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01)
 # A value stands on a step if it is this near, in steps: chance brings it there once in 10^5.
@@ -249,17 +246,12 @@ class TiltLog:
         the others is left out; two that follow each other and agree are of a turn. If the readings scatter more than
         stated (wind, footsteps), the covariance is larger.
         Its `step_rad` says whether they are rounded, or repeat without an end.
-        TiltError if they do not cover the exposure, the instrument moved, or the sensor was stuck.
+        TiltError if they do not cover the exposure, or the instrument moved.
 
         spread_s: the full width within which the middle may lie, for a clock of whole seconds; then readings within it
         represent the exposure, if all of them agree.
         """
         use = self._first(self._of_exposure(mid_unix_s, exposure_s, spread_s))
-        if self.stuck[use].any():
-            raise TiltError(
-                f"the inclinometer repeats the same value in {STUCK_READINGS} readings or more, though its noise is "
-                "larger than its steps: check its converter's wiring"
-            )
         repeats = tuple(self._repeats[use].any(0).tolist())
         return replace(self._mean(use, self.step_rad), step_rad=self._steps[repeats])
 
@@ -302,35 +294,6 @@ class TiltLog:
     def _first(self, use: np.ndarray) -> np.ndarray:
         """The readings of `use`, in order of time, without the copies of another one there."""
         return use[np.unique(self._number[use], return_index=True)[1]]
-
-    @cached_property
-    def stuck(self) -> np.ndarray:
-        """Mask (N,) of the readings that stand in a row of STUCK_READINGS or more that are equal to the last digit.
-
-        No reading counts as stuck if the noise does not clearly exceed the steps of the readings, judged by the stated
-        noise and by how rarely other neighbours are equal.
-        """
-        stuck = np.zeros(len(self.utc_unix_s), bool)
-        order = self._each
-        steps = np.diff(self.theta[order], axis=0)
-        equal = (steps == 0).all(1)
-        begin, end = _runs(equal)
-        rows = end - begin >= STUCK_READINGS - 1
-        begin, end = begin[rows], end[rows]
-        # all but these, of an instrument at rest
-        free = np.diff(self.utc_unix_s[order]) < NEIGHBOURS_S
-        noise = self.excess * float(np.sqrt(self.variance.mean()))
-        free &= (np.abs(steps) < np.sqrt(2) * OUTLIER_SIGMA * noise).all(1)
-        for first, last in zip(begin, end, strict=True):
-            free[first:last] = False
-        if free.sum() < max(MIN_NEIGHBOURS, (end - begin).sum() / MOSTLY_STUCK):
-            return stuck
-        moved = np.abs(steps[free])
-        coarse = np.where(moved > 0, moved, np.inf).min() > noise
-        if not coarse and equal[free].mean() < RARE:
-            for first, last in zip(begin, end, strict=True):
-                stuck[order[first : last + 1]] = True
-        return self._of_copies(stuck)
 
     @property
     def step_rad(self) -> float:

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is known of instrument and vehicle before a voyage, with the laws of motion where nothing measures the speed."""
 
-import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import VoyageError
 from starpos.navigation.records import ImuModel
 
 
@@ -57,8 +55,6 @@ LAWS = {
 }
 # default: any vehicle on land, at sea or in the air
 ANYTHING = _law(100.0, 1.0, 30.0, 0.3, 5.0, 3.0, 10.0)
-# what is said of a drift is how much it changes in so long
-CHANGE_S = 600.0
 # of a drift such a share changes in an hour
 DRIFT_CHANGE, DRIFT_CHANGE_S = 0.5, 3600.0
 
@@ -68,12 +64,11 @@ PARKED, ROVER = "parked", "rover"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Vessel:
-    """An instrument on a vehicle; VoyageError for a drift that it cannot have.
+    """An instrument on a vehicle.
 
     vehicle: a name in LAWS, or None for anything.  model: of the IMU.
     camera_to_body (3, 3), mount_stddev: as believed, and rad an axis.  clock_stddev_s: of the stamps against UTC.
     drift_stddev: m/s an axis, of water or air against the ground, where velocities are measured against these.
-    drift_change: m/s an axis, 1 sigma, by which water or air change in ten minutes; NaN: as the law has it.
     height_m, height_stddev_m: above the ellipsoid; by itself anywhere on land.
     """
 
@@ -84,29 +79,19 @@ class Vessel:
     atmosphere: Atmosphere
     clock_stddev_s: float
     drift_stddev: float = 0.0
-    drift_change: float = math.nan
     height_m: float = 500.0
     height_stddev_m: float = 2000.0
-
-    def __post_init__(self) -> None:
-        check_drift(self.vehicle, self.drift_stddev, self.drift_change)
 
     @property
     def law(self) -> MotionLaw:
         """How its speed changes where nothing measures it."""
-        return self._drifting(ANYTHING if self.vehicle is None else LAWS[self.vehicle])
+        return ANYTHING if self.vehicle is None else LAWS[self.vehicle]
 
     @property
     def carried(self) -> MotionLaw:
         """How the drift changes where velocities are measured against water or air."""
         walk = DRIFT_CHANGE * self.drift_stddev / DRIFT_CHANGE_S**0.5
-        return self._drifting(_law(1e-3, 1e-6, self.drift_stddev, walk, 1e-3, 1e-3, 1.0))
-
-    def _drifting(self, law: MotionLaw) -> MotionLaw:
-        """The law with the drift's stated change, as it walks at random."""
-        if math.isnan(self.drift_change):
-            return law
-        return replace(law, drift_walk=self.drift_change / CHANGE_S**0.5)
+        return _law(1e-3, 1e-6, self.drift_stddev, walk, 1e-3, 1e-3, 1.0)
 
     @property
     def parked(self) -> bool:
@@ -117,16 +102,3 @@ class Vessel:
     def halts(self) -> bool:
         """Whether it may stand on the ground now and then."""
         return self.vehicle == ROVER
-
-
-def check_drift(vehicle: str | None, drift_stddev: float, drift_change: float) -> None:
-    """Raise VoyageError if it cannot be so, as of a vehicle that has no drift."""
-    if math.isnan(drift_change):
-        return
-    if not 0 < drift_change < math.inf:
-        raise VoyageError(f"drift change {drift_change:g} m/s: it must be a finite number above 0")
-    if vehicle in (PARKED, ROVER) and not drift_stddev:
-        raise VoyageError(
-            f"drift change {drift_change:g} m/s: it is of wind or current, and neither carries a vehicle that is "
-            f"'{vehicle}'"
-        )

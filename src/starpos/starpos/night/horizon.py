@@ -2,7 +2,7 @@
 """The horizon of a camera that stands still, learned from where bright stars never are: trees, houses, hills."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +12,14 @@ from starpos.errors import FrameError
 from starpos.files import save
 from starpos.fix.searching import Sight
 from starpos.instrument.camera import Camera
+from starpos.night.extinction import air_mass
 from starpos.sky.catalogue import Catalogue
 from starpos.tables import TableForm
 
 # stars that are brighter by this than the faintest identified ones are missed behind clouds, trees and houses alone
 SURELY_SEEN_MAG = 1.5
+# mag per air mass
+HAZE = 0.5
 # how often such a star is identified above the horizon, and, by a wrong match, below it
 SEEN, WRONGLY = 0.85, 0.03
 # number of parts of the azimuths, and the fewest stars around one that show the horizon there
@@ -29,11 +32,15 @@ TABLE = TableForm(what="table of a horizon", error=FrameError, needed=("azimuth_
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Azimuth and altitude (N,) of bright stars that a frame may show, in deg, and whether they were identified (N,)."""
+    """Azimuth and altitude (N,) of bright stars that a frame may show, in deg, and whether they were identified (N,).
+
+    margin_mag (N,): by how much each would be brighter at the zenith than the faintest identified ones.
+    """
 
     azimuth_deg: np.ndarray
     altitude_deg: np.ndarray
     seen: np.ndarray
+    margin_mag: np.ndarray
 
 
 def expected(sight: Sight, camera: Camera, catalogue: Catalogue) -> Expected:
@@ -41,26 +48,31 @@ def expected(sight: Sight, camera: Camera, catalogue: Catalogue) -> Expected:
     at, found = sight.solution.at_place, sight.found
     assert at is not None and found is not None
     state, to_local = earth_state(at.utc_unix_s), at.place.plumb_axes
-    limit = np.percentile(catalogue.vmag(found.catalogue), 95) - SURELY_SEEN_MAG
-    rows = catalogue.cone(to_local[2] @ state.gcrs_to_itrs, np.radians(89.5), float(limit))
+    limit = float(np.percentile(catalogue.vmag(found.catalogue), 95))
+    rows = catalogue.cone(to_local[2] @ state.gcrs_to_itrs, np.radians(89.5), limit - SURELY_SEEN_MAG)
     v = state.to_itrs(catalogue.directions(rows, state.year)) @ to_local.T
     xy = camera.project(v @ at.optics.rotation)
     with np.errstate(invalid="ignore"):
         on = ((xy > 0) & (xy < np.array([camera.width, camera.height]) - 1)).all(1)
     v, rows = v[on], rows[on]
     azimuth, altitude = np.arctan2(v[:, 0], v[:, 1]), np.arcsin(v[:, 2])
-    return Expected(np.degrees(azimuth) % 360, np.degrees(altitude), np.isin(rows, found.catalogue))
+    seen, margin = np.isin(rows, found.catalogue), limit - catalogue.vmag(rows)
+    return Expected(np.degrees(azimuth) % 360, np.degrees(altitude), seen, margin)
 
 
-def horizon(stars: Sequence[Expected]) -> np.ndarray:
+def horizon(stars: Sequence[Expected], extinction: float = np.nan) -> np.ndarray:
     """Azimuths and altitudes (PARTS, 2) of the horizon, deg; NaN where too few stars have passed.
 
+    extinction: in mag per air mass, by which low stars are fainter; NaN: unknown, then haze is assumed.
     In each part of the azimuths it is the lowest altitude that divides stars that are seen from those that are not nearly
     as well as the best.
     """
-    azimuth, altitude, seen = (
-        np.concatenate([getattr(s, name) for s in stars]) for name in ("azimuth_deg", "altitude_deg", "seen")
+    azimuth, altitude, seen, margin = (
+        np.concatenate([getattr(s, f.name) for s in stars]) for f in fields(Expected)
     )
+    dimmed = (HAZE if np.isnan(extinction) else extinction) * (air_mass(altitude) - 1)
+    bright = margin - dimmed > SURELY_SEEN_MAG
+    azimuth, altitude, seen = azimuth[bright], altitude[bright], seen[bright]
     width = 360 / PARTS
     middles = (np.arange(PARTS) + 0.5) * width
     found = np.full(PARTS, np.nan)

@@ -63,7 +63,7 @@ class Records:
     velocity: CSV of velocities over ground, along the body's axes; None without one.
     vehicle: a key of `vessel.LAWS`, or 'parked'; None: anything that moves.
     mount_stddev_deg: error of the camera's stated orientation on the vehicle.
-    drift_stddev, drift_change: of current or wind, m/s, where velocities are through water or air.
+    drift_stddev: of current or wind, m/s, where velocities are through water or air.
     height_m: of the vehicle; None: not known.
     """
 
@@ -73,7 +73,6 @@ class Records:
     vehicle: str | None = None
     mount_stddev_deg: float = MOUNT_STDDEV_DEG
     drift_stddev: float = 0.0
-    drift_change: float = math.nan
     height_m: float | None = None
 
     def vessel(
@@ -95,7 +94,6 @@ class Records:
             atmosphere=atmosphere,
             clock_stddev_s=instrument.clock_stddev_s,
             drift_stddev=self.drift_stddev,
-            drift_change=self.drift_change,
         )
         if self.height_m is not None:
             vessel = replace(vessel, height_m=self.height_m, height_stddev_m=GIVEN_HEIGHT_STDDEV_M)
@@ -136,7 +134,7 @@ def navigate(
     atmosphere : of refraction; None: not measured
     progress : is called with the share of the work that is done
     **records : the other fields of `Records`: imu_model, velocity, vehicle, mount_stddev_deg, drift_stddev,
-        drift_change, height_m
+        height_m
 
     Returns
     -------

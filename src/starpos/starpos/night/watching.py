@@ -17,11 +17,13 @@ from starpos.fix.solution import Solution
 from starpos.fix.terms import total_covariance
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.night.extinction import Light, extinction
 from starpos.units import ARCSEC, DAY_S, HOUR_S
 
 # how far an untouched camera may wander from night to night, 1 sigma per axis: from the stiffest mount to a post in the
-# Sun, each size as probable as any other until the nights have shown it
-WANDERS_RAD = np.geomspace(0.3, 20, 25) * ARCSEC
+# Sun.  Until the nights have shown it, each size up to USUAL_RAD is as probable as any other, and larger ones are so rare
+# that a third night already shows a knock
+WANDERS_RAD, USUAL_RAD, RARER = np.geomspace(0.3, 60, 30) * ARCSEC, 10 * ARCSEC, 5
 # a camera that stands still leaves its own scatter by more in this share of the nights
 ALARM_CHANCE = 1e-6
 # the sky is measured within SKY_RAD of the axis, the black level beyond DARK_RAD, on each SPARSE-th pixel of each
@@ -40,7 +42,8 @@ class NightPose:
 
     day: the date of its evening by local mean time.  stars: number of identified ones.
     optics: C in east, north, up.  focal_px: mean of the frames, on the axis.
-    limit_mag: V of the faintest stars; sky_mag: V of the sky per square arcsec; NaN where they are not known.
+    limit_mag: V of the faintest stars, by the extinction, where it is known, as if at the zenith.
+    extinction, extinction_sigma: mag per air mass.  sky_mag: V of the sky per square arcsec.  NaN: not known.
     """
 
     day: str
@@ -50,6 +53,8 @@ class NightPose:
     optics: Attitude
     focal_px: float
     limit_mag: float
+    extinction: float
+    extinction_sigma: float
     sky_mag: float
 
     @property
@@ -89,10 +94,11 @@ class Kept:
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """A frame's solution with an attitude at a known place, its camera's focal length in px, and its sky_mag."""
+    """A frame's solution with an attitude at a known place; its camera's focal length in px, its stars, its sky_mag."""
 
     solution: Solution
     focal_px: float
+    light: Light
     sky_mag: float = np.nan
 
 
@@ -151,8 +157,10 @@ def _stands(answers: Sequence[Answer]) -> bool:
 
 def _pose(day: str, answers: Sequence[Answer]) -> NightPose:
     mean = mean_attitude([_at(a) for a in answers])
-    magnitudes = np.concatenate([np.asarray(a.solution.magnitudes, float) for a in answers])
-    known = magnitudes[np.isfinite(magnitudes)]
+    lights = [a.light for a in answers]
+    k, sigma = extinction(lights)
+    dimmed = [np.nan_to_num(k) * (light.air_mass - 1) for light in lights]
+    known = np.concatenate([light.v + more for light, more in zip(lights, dimmed, strict=True)])
     sky = np.array([a.sky_mag for a in answers if np.isfinite(a.sky_mag)])
     return NightPose(
         day=day,
@@ -162,6 +170,8 @@ def _pose(day: str, answers: Sequence[Answer]) -> NightPose:
         optics=mean.optics,
         focal_px=float(np.mean([a.focal_px for a in answers])),
         limit_mag=float(np.percentile(known, LIMIT_PERCENTILE)) if len(known) else np.nan,
+        extinction=k,
+        extinction_sigma=sigma,
         sky_mag=float(np.median(sky)) if len(sky) else np.nan,
     )
 
@@ -172,7 +182,7 @@ def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
     The sizes of the wander from night to night are weighed by what the nights have shown of them so far.
     """
     before: list[NightPose] = []
-    log_weight = np.zeros(len(WANDERS_RAD))
+    log_weight = -RARER * np.log(np.maximum(WANDERS_RAD / USUAL_RAD, 1))
     found = []
     for pose in poses:
         turned, covariance, alarm = np.zeros(3), pose.own, False

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import ModuleType
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 from starpos.errors import BagError, one_line
 from starpos.files import open_regular
@@ -207,6 +207,7 @@ def _too_large(size: int) -> BagError:
 PACKAGE = "starpos_interfaces"
 # the latest time that ROS can hold
 LAST_NS = (2**31 - 1) * 10**9
+B = TypeVar("B", bound="BagReader")
 
 
 class BagReader:
@@ -221,7 +222,7 @@ class BagReader:
         self._typed = typed
         self._open = ExitStack()
 
-    def __enter__(self) -> "BagReader":
+    def __enter__(self: B) -> B:
         try:
             from rosbags.highlevel import AnyReader
             from rosbags.rosbag2 import Reader

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A gyro's readings of the last minute: how the body has turned, and the trails that this gives the stars of a frame."""
+"""A gyro's readings of the last minute: how the body has turned."""
 
 from dataclasses import replace
 from typing import Any
@@ -7,15 +7,10 @@ from typing import Any
 import numpy as np
 
 from starpos.errors import VoyageError
-from starpos.frames.exposure import Trail
-from starpos.frames.frame import Frame
-from starpos.instrument.instrument import TOP_OF_FRAME
-from starpos.messages.camera import message_to_camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.navigation.preintegration import turn_between
 from starpos.navigation.recent import BACK_S, RecentReadings
 from starpos.navigation.records import clipped
-from starpos.session.settings import known_instrument
 
 # time for which readings are kept, and length of a block
 KEPT_S, BLOCK_S = 60.0, 1.0
@@ -70,50 +65,3 @@ class GyroReadings:
             return None
         turn, missing_s = turn_between(replace(imu, gyro=imu.gyro - bias), begin_s, end_s)
         return turn if missing_s <= most_missing_s else None
-
-
-# this share of an exposure may be without readings
-MAX_MISSING = 0.1
-# cosine of the largest turn in an exposure: 60 deg
-MIN_COSINE = 0.5
-
-
-class Trails:
-    """Takes a gyro's readings and the camera's intrinsics, and gives frames their trails.
-
-    calibration_url: instrument file whose link_to_camera takes the IMU's axes into C, '' for the usual ones;
-    InstrumentError if it is broken.
-    """
-
-    def __init__(self, calibration_url: str) -> None:
-        # it needs scipy's rotations, which a detector without a gyro does not load
-        known = known_instrument(calibration_url)
-        self._link = np.asarray(known.link_to_camera if known else TOP_OF_FRAME, float)
-        self._readings = GyroReadings()
-        self._focal_px: float | None = None
-
-    def receive_imu(self, message: Any) -> None:
-        """Take a sensor_msgs/Imu; VoyageError in a sentence if it cannot be used."""
-        self._readings.receive(message)
-
-    def receive_camera(self, message: Any) -> None:
-        """Take a CameraInfo; InstrumentError in a sentence if it cannot be used."""
-        # a size that it leaves open does not matter here
-        self._focal_px = message_to_camera(message, size=(1, 1)).fx
-
-    def with_trail(self, frame: Frame) -> Frame:
-        """The frame with its trail; as it is where time, exposure, focal length or readings lack, or it turned far."""
-        if self._focal_px is None or frame.mid_unix_s is None or not frame.exposure_s:
-            return frame
-        begin_s, end_s = (frame.mid_unix_s + share * frame.exposure_s for share in (-0.5, 0.5))
-        turn = self._readings.turn(begin_s, end_s, MAX_MISSING * frame.exposure_s, np.zeros(3))
-        if turn is None:
-            return frame
-        # of directions at the beginning into those at the end; its last column is where a star on the axis goes
-        moved = self._link @ turn.T @ self._link.T
-        x, y = self._focal_px * moved[:2, 2] / max(moved[2, 2], MIN_COSINE)
-        # turned so far that stars cross the frame: their trail cannot be determined
-        if np.trace(moved) < 1 + 2 * MIN_COSINE or np.hypot(x, y) > frame.width + frame.height:
-            return frame
-        roll_rad = np.arctan2(moved[1, 0] - moved[0, 1], moved[0, 0] + moved[1, 1])
-        return replace(frame, trail=Trail(middle_px=(float(x), float(y)), roll_rad=float(roll_rad)))

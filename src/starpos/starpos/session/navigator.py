@@ -27,7 +27,7 @@ from starpos.navigation.estimate import Estimate, Observability, VoyageFix, obse
 from starpos.navigation.recent import BACK_S, LONGEST_GAP_S, Recent
 from starpos.navigation.records import ImuModel, read_imu_model
 from starpos.navigation.sightings import PlacelessFrame, SunFrame, body_attitude
-from starpos.navigation.vessel import PARKED, Vessel, check_drift
+from starpos.navigation.vessel import PARKED, Vessel
 from starpos.navigation.voyage import MIN_FRAMES, Voyage
 from starpos.session.driver import Changes, Diagnosis, Heard, Jobs, Level, Log, Now, Outcome, refusing
 from starpos.session.gnss import OLDEST_S, ComparedPlaces, contradiction
@@ -46,9 +46,6 @@ class NavigatorSettings(NodeSettings):
         **NodeSettings.readers,
         "imu_model": lambda name: read_imu_model(path_of(name)),
     }
-
-    def _refuse(self, values: Mapping[str, Any], files: Mapping[str, Any]) -> None:
-        check_drift(values["vehicle"], values["drift_stddev"], values["drift_change"])
 
     def vessel(self, clock_stddev_s: float) -> Vessel:
         """Instrument and vehicle, of which the frames' clock states its error."""
@@ -71,7 +68,6 @@ class NavigatorSettings(NodeSettings):
             atmosphere=atmosphere_of(values),
             clock_stddev_s=max(known.clock_stddev_s, clock_stddev_s) if np.isnan(clock) else clock,
             drift_stddev=values["drift_stddev"],
-            drift_change=values["drift_change"],
             **stated,
         )
 

@@ -57,7 +57,7 @@ def test_exact_elevations_give_the_exact_place(rng):
 def test_claims_are_true_over_many_nights(azimuths, noise, least):
     found = []
     # a scale that is found in the residuals makes wide tails
-    for seed in range(60 if noise > 1 else 20):
+    for seed in range(60 if noise > 1 else 12):
         night = pointed_night(np.random.default_rng(seed), azimuths, frames=1, noise=noise)
         found.append(night.place_nees(place_of_circles(circles(night))))
     assert least < np.mean(found) < 2.8
@@ -68,13 +68,13 @@ def test_claims_are_true_over_many_nights(azimuths, noise, least):
 def test_three_directions_that_contradict_each_other_are_no_place():
     """One residual does not show by how much they err: 8 of 100 such nights were beyond 5 sigma."""
     refused = []
-    for seed in range(12):
+    for seed in range(6):
         night = pointed_night(np.random.default_rng(seed), THREE, frames=1, noise=120.0)
         try:
             place_of_circles(circles(night))
         except FixError as e:
             refused.append(str(e))
-    assert len(refused) >= 10 and all("add directions" in said for said in refused)
+    assert len(refused) >= 5 and all("add directions" in said for said in refused)
 
 
 def test_an_error_of_every_pose_is_one_error_of_its_frames(rng):

@@ -103,14 +103,14 @@ def test_half_a_turn_takes_the_calibration_off_the_position(rng):
 @pytest.mark.parametrize("calibration", [0.0, 15.0])
 def test_an_average_errs_as_its_covariance_says(calibration, rng):
     position, heading = [], []
-    for _ in range(60):
+    for _ in range(30):
         field = random_field(rng, altitude=85.0, latitude=rng.uniform(-70, 70), stars=15)
         a = average(fixes(field, rng, [field.azimuth] * 4, calibration=calibration))
         m = moved_m(a, field)
         position.append(m @ np.linalg.solve(a.covariance[:2, :2], m))
         heading.append(rotation.half_turn(a.heading - field.heading) ** 2 / a.covariance[2, 2])
-    assert np.mean(position) / 2 == pytest.approx(1, abs=4 / np.sqrt(60))
-    assert np.mean(heading) == pytest.approx(1, abs=4 * np.sqrt(2 / 60))
+    assert np.mean(position) / 2 == pytest.approx(1, abs=4 / np.sqrt(30))
+    assert np.mean(heading) == pytest.approx(1, abs=4 * np.sqrt(2 / 30))
 
 
 def test_an_instrument_that_turned_has_the_heading_of_its_last_pose(rng):
@@ -253,7 +253,7 @@ def test_as_they_come_or_all_at_once(rng):
 
 def test_frames_that_share_a_few_readings_are_believed_and_no_more_than_is_due(rng):
     """Every third frame has lost its own readings: its tilt comes from the readings around it."""
-    field, off, n = SkyField(altitude=85.0), [], 30
+    field, off, n = SkyField(altitude=85.0), [], 15
     for _ in range(n):
         readings = rng.normal(0, 5 * ARCSEC, (30, 2))
         averager = Averager()
@@ -321,8 +321,7 @@ def slipped(f, seconds):
 
 
 @pytest.mark.montecarlo
-@pytest.mark.parametrize("seconds", [1.0, -1.0, 60.0, 3600.0])
-@pytest.mark.parametrize("at", [0, 7, 24])
+@pytest.mark.parametrize(("seconds", "at"), [(1.0, 0), (-1.0, 7), (60.0, 24), (3600.0, 7)])
 def test_a_wrong_time_stamp_does_not_move_it(seconds, at, rng):
     field = SkyField()
     made = fixes(field, rng, [40.0] * 25, tilt=1.0)

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fisheyes from the sky: their coefficients within what is claimed, and a fix with the camera that was found."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from starpos.calibration.camera import calibrate_camera, fit_camera, rms
+from starpos.calibration.camera import calibrate_camera, fit_camera, hour_by_lens, rms
 from starpos.calibration.camera_adjustment import parameters
 from starpos.earth.place import Place
 from starpos.errors import CalibrationError, PlaceError
@@ -69,7 +70,7 @@ def test_the_coefficients_are_found_within_what_is_claimed(lens, catalogue, rng)
 @pytest.mark.montecarlo
 def test_over_many_fisheyes_the_errors_are_those_claimed(rng):
     z, given = [], Camera.from_focal(1300, 1300, 600.0, EQUIDISTANT)
-    for _ in range(30):
+    for _ in range(15):
         lens = (rng.uniform(-0.03, 0.08), *rng.normal(0, [2e-3, 1e-4, 1e-5]).tolist())
         cx, cy = (np.array(given.centre_px) + rng.normal(0, 15, 2)).tolist()
         true = replace(random_fisheye(lens, rng), width=1300, height=1300, cx=cx, cy=cy)
@@ -126,6 +127,27 @@ def test_a_frame_of_the_middle_of_the_sky_does_not_show_its_hour(catalogue, rng)
     answer = answer_frame(solver, Question(item=middle, stars=middle, places=SITE)).solution
     assert answer.at_place is not None and "its hour is right" in answer.remark
     assert answer.with_remark("first").remark == f"first; {answer.remark}"
+    # with no error of the clock stated the hour may be wrong
+    from_files = replace(solver, hour_by_lens=hour_by_lens)
+    wide = answer_frame(from_files, Question(item=middle, stars=middle, places=SITE)).solution.at_place
+    assert math.sqrt(wide.plumb.angles_covariance[0, 0]) > math.radians(5)
+    stated = replace(from_files, instrument=replace(solver.instrument, clock_stddev_s=1.0))
+    known = answer_frame(stated, Question(item=middle, stars=middle, places=SITE)).solution.at_place
+    assert math.sqrt(known.plumb.angles_covariance[0, 0]) < math.radians(0.2)
+
+
+def test_a_frame_of_an_unknown_lens_shows_its_hour_or_claims_to_miss_it(catalogue, rng):
+    true = random_fisheye(LENSES["equisolid"], rng)
+    (stars,), _ = nights(true, catalogue, rng, 1)
+    solver = Solver(Instrument(IDEAL.fx, model=EQUIDISTANT), catalogue, AIR, hour_by_lens=hour_by_lens)
+    right = answer_frame(solver, Question(item=stars, stars=stars, places=SITE)).solution
+    assert right.at_place.hour_shown and not right.remark
+    for late_s in (-3600, 3600):
+        late = replace(stars, mid_unix_s=stars.mid_unix_s + late_s)
+        wrong = answer_frame(solver, Question(item=late, stars=late, places=SITE)).solution.at_place
+        if wrong is not None:
+            off = math.remainder(wrong.plumb.heading - right.at_place.plumb.heading, 2 * math.pi)
+            assert abs(off) < 3 * math.sqrt(wrong.plumb.angles_covariance[0, 0])
 
 
 def test_without_tilts_refraction_would_pass_for_the_lens(catalogue, rng):

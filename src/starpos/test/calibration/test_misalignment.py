@@ -98,12 +98,12 @@ def test_two_leans_tell_all_of_a3(catalogue, rng, given):
 
 @pytest.mark.montecarlo
 def test_a3_errs_as_its_covariance_says(catalogue):
-    """Chi-squares of 15 calibrations average to the 3 that three angles have."""
+    """Chi-squares of ten calibrations average to the 3 that three angles have."""
     chi2 = []
-    for seed in range(15):
+    for seed in range(10):
         shot = shots(catalogue, np.random.default_rng(seed), [0.0, 5.0, -4.0])
         chi2.append(a3_error(shot, found_at(shot, catalogue).instrument.calibration)[1])
-    assert np.mean(chi2) == pytest.approx(3, abs=3.5 * np.sqrt(6 / 15))
+    assert np.mean(chi2) == pytest.approx(3, abs=3.5 * np.sqrt(6 / 10))
 
 
 TEN = [0.0] * 5 + [5.0] * 5
@@ -118,9 +118,8 @@ def ten(catalogue):
 
 
 @pytest.mark.montecarlo
-@pytest.mark.parametrize("off_deg", [0.02, 0.1, 1.0, -20.0])
-@pytest.mark.parametrize("which", [0, 4, 9])
-def test_a_bad_tilt_among_ten_does_not_move_it(catalogue, ten, off_deg, which):
+@pytest.mark.parametrize(("which", "off_deg"), [(4, 0.02), (9, 0.1), (0, 1.0), (4, -20.0)])
+def test_a_bad_tilt_among_ten_does_not_move_it(catalogue, ten, which, off_deg):
     """Refused or carried along, a reading that is degrees off cost the calibration; its frame is left out instead."""
     expected, expected_off = ten
     shot = shots(catalogue, np.random.default_rng(7), TEN)
@@ -246,8 +245,14 @@ def test_a_site_that_is_off_moves_a3_by_as_much(catalogue):
     assert np.degrees(f.longitude) == pytest.approx(site.longitude_deg, abs=0.3 / 3600)
 
 
-@pytest.mark.parametrize("a3_deg", [(1.0, -2.0, 180.0), (0.5, 0.5, -179.9999), (-2.0, 1.0, 179.99999)])
-@pytest.mark.parametrize("given", [(0.0, 0.0, 0.0), (0.0, 0.0, 179.9)])
+@pytest.mark.parametrize(
+    ("a3_deg", "given"),
+    [
+        ((1.0, -2.0, 180.0), (0.0, 0.0, 179.9)),
+        ((0.5, 0.5, -179.9999), (0.0, 0.0, 179.9)),
+        ((-2.0, 1.0, 179.99999), (0.0, 0.0, 0.0)),
+    ],
+)
 def test_a_camera_the_other_way_round_than_the_inclinometer(catalogue, rng, a3_deg, given):
     shot = shots(catalogue, rng, [0.0, 5.0, -5.0], a3_deg)
     found = found_at(shot, catalogue, given)

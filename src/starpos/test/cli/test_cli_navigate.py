@@ -113,11 +113,6 @@ def test_a_model_that_is_none(voyage, capsys, tmp_path):
         assert status == 2 and said in errors[0], json.dumps(errors)
 
 
-def test_a_velocity_over_ground_has_no_drift_that_changes(voyage, capsys):
-    status, out, errors = navigate(capsys, voyage[0], "--drift-change", "0.1")
-    assert status == 2 and out == "" and "--drift-stddev" in errors[-1]
-
-
 def cards(folder, to, **more):
     """Copies of the star lists with more cards in their headers."""
     for path in folder.glob("stars_*.csv"):

@@ -8,7 +8,7 @@ from scipy import ndimage, sparse, spatial
 from starpos.detection._learn import phase_fluxes, unit_light
 from starpos.detection._neighbours import any_near, group_points, near_pairs
 from starpos.detection._pixels import smooth_mosaic
-from starpos.detection._vetting import brightest_left, count_marked
+from starpos.detection._vetting import brightest_left
 
 
 @pytest.mark.parametrize("number", [1, 2, 30, 300])
@@ -98,11 +98,6 @@ def test_the_brightest_pixel_left_is_that_of_a_filtered_image(rng):
     expected = np.divmod(smooth.reshape(30, -1).argmax(1), 15)
     found = brightest_left(residual, good.view(np.uint8), left, top, axes, 1.0, 3.0, weight)
     np.testing.assert_array_equal(found, expected)
-
-
-def test_marks_are_counted(rng):
-    marks = rng.random((6, 9, 9)) < 0.3
-    np.testing.assert_array_equal(count_marked(marks), marks.sum((1, 2)))
 
 
 def test_fluxes_of_phases_are_weighted_means(rng):

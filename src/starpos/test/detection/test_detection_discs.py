@@ -18,7 +18,10 @@ def plate(stars, fwhm_px, rng, size=SIZE, soft=False, noise=2.0):
     width2 = (fwhm_px / 1.13) ** 2
     light = np.zeros(size)
     for column, row, flux in stars:
-        light += 1.5 * flux / (np.pi * width2) * (1 + ((x - column) ** 2 + (y - row) ** 2) / width2) ** -2.5
+        # beyond, the brightest has less than 0.05 DN
+        near = tuple(slice(max(0, int(middle) - 200), int(middle) + 200) for middle in (row, column))
+        spread = 1 + ((x[near] - column) ** 2 + (y[near] - row) ** 2) / width2
+        light[near] += 1.5 * flux / (np.pi * width2) / (spread**2 * np.sqrt(spread))
     light += rng.normal(0, noise, size)
     if soft:
         light = (TOP - SKY) * (1 - np.exp(-light / (TOP - SKY)))

@@ -98,12 +98,8 @@ def test_stars_under_a_trail_are_measured_as_well_as_they_say(rng):
     slope = (end[1] - start[1]) / (end[0] - start[0])
     x = np.arange(40, 800, 30) + rng.uniform(-1, 1, 26)
     under = np.stack([x, start[1] + slope * (x - start[0]) + rng.uniform(-4, 4, 26), np.full(26, 12000.0)], 1)
-    stars = np.concatenate(
-        [
-            under,
-            [s for s in grid(SIZE, 60, 12000, rng) if trail(start, end, 1, 9)[int(s[1]), int(s[0])] < 1e-3],
-        ]
-    )
+    near, others = trail(start, end, 1, 9), grid(SIZE, 60, 12000, rng)
+    stars = np.concatenate([under, [s for s in others if near[int(s[1]), int(s[0])] < 1e-3]])
     found = detect(Frame(noisy(field(SIZE, stars) + trail(start, end, 1500), rng))).stars
     index = match(found, under)
     assert np.mean(index >= 0) > 0.9

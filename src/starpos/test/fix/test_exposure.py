@@ -15,8 +15,10 @@ CAMERA = Camera.from_focal(640, 480, 5208.0)
 SKY = np.array([[0.5, 0.0, np.sqrt(0.75)]])
 
 
-def stars(fwhm_px, exposure_s):
-    return SimpleNamespace(fwhm_px=fwhm_px, exposure_s=exposure_s, place="frame")
+def stars(fwhm_px, exposure_s, longer=1.0):
+    """Stars of a width, whose errors are this many times as large along as across."""
+    covariance = np.diag([longer**2, 1.0])[None] * 1e-4
+    return SimpleNamespace(fwhm_px=fwhm_px, exposure_s=exposure_s, covariance=covariance, place="frame")
 
 
 @pytest.mark.parametrize(("fwhm_px", "exposure_s"), [(2.5, 60.0), (2.5, 300.0), (4.0, 500.0), (1.5, 45.0)])
@@ -36,3 +38,22 @@ def test_stars_that_trail_or_have_no_width_are_believed(fwhm_px, exposure_s):
 
 def test_near_the_pole_stars_hardly_trail():
     check_exposure(stars(2.5, 200.0), CAMERA, np.array([[0.02, 0.0, np.sqrt(1 - 0.0004)]]))
+
+
+# s, px and their lengths over widths as the detector measures them on simulated trails of stars of 2.4 and 1.6 px
+TRAILED = [
+    (10.0, 2.61, 1.10),
+    (20.0, 2.96, 1.40),
+    (20.0, 2.33, 1.72),
+    (40.0, 3.85, 2.12),
+    (40.0, 3.13, 2.58),
+    (80.0, 5.31, 3.06),
+]
+
+
+@pytest.mark.parametrize(("exposure_s", "fwhm_px", "longer"), TRAILED)
+def test_shapes_tell_trails_from_points(exposure_s, fwhm_px, longer):
+    check_exposure(stars(fwhm_px, exposure_s, longer), CAMERA, SKY)
+    if longer > 1.5:
+        with pytest.raises(FixError, match="exposure time is wrong"):
+            check_exposure(stars(fwhm_px, exposure_s, 1.05), CAMERA, SKY)

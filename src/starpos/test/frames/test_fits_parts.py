@@ -113,7 +113,12 @@ FF = "FF_XX0001_20240618_011731_867_1054720.fits", "FF_XX0001_20240618_011731_86
 @pytest.mark.parametrize(("name", "start"), [(FF[0], None), (FF[1], "2024-06-18T02:00:00")])
 def test_a_stack_of_a_meteor_camera_is_its_mean_and_one_exposure(tmp_path, name, start):
     primary = fits.PrimaryHDU()
-    primary.header.update({"NFRAMES": 256, "FPS": 25.0, "CAMNO": "XX0001"})
+    primary.header.update({"NFRAMES": 256, "CAMNO": "XX0001"})
+    # the rate is in the header, or in the configuration in its folder
+    if start:
+        primary.header["FPS"] = 25.0
+    else:
+        (tmp_path / ".config").write_text("[Capture]\nfps: 25.0 ; frames per second\n")
     if start:
         primary.header["DATE-OBS"] = start
     names = "MAXPIXEL", "MAXFRAME", "AVEPIXEL", "STDPIXEL"

@@ -122,6 +122,10 @@ UTC = {**START, "EXPTIME": 4}
         {"JD": "2461347.2500231"},
         {"EXPSTART": 61346.75},
         {"UNIXTIME": START_S},
+        {"MJD": 61346.75, "OBSJD": 2461347.25, "UT-START": "18:00:00", "GPS-TIME": "2026-11-02T18:00:00"},
+        {"MJD": 61346},
+        {"GPSTIME": 151218.0},
+        {"GPSTIME": 1.478e9},
         {"DATE-LOC": "2026-11-02T20:00:00", "TIMEZONE": 2},
         {"DATE-LOC": "2026-11-02T13:00:00", "TIMEZONE": "UTC-5"},
         {"TIMEZONE": 0},
@@ -156,6 +160,10 @@ def test_cards_that_agree_with_utc_change_nothing(cards):
         ({"EXPSTART": 61346.75}, "EXPSTART"),
         ({"EXPSTART": "2026-11-02T18:00:00"}, "EXPSTART"),
         ({"UNIXTIME": START_S}, "UNIXTIME"),
+        ({"MJD": 61346.75}, "MJD"),
+        ({"OBSJD": 2461347.25}, "OBSJD"),
+        ({"UT-START": "18:00:00"}, "UT-START"),
+        ({"GPS-TIME": "2026-11-02T18:00:00"}, "GPS-TIME"),
         ({"UT": "17:11:00"}, "contradict"),
         ({"TIMEZONE": 2}, "TIMEZONE is \\+2 h"),
         ({"TIMEZONE": "+02:00", "DATE-LOC": "2026-11-02T20:00:00"}, "local time"),
@@ -197,6 +205,8 @@ def test_a_comment_says_which_moment_a_date_is(comment, middle_s):
         ("UTC+1", "local"),
         ("GMT -5, start", "local"),
         ("GPS time", "GPS"),
+        ("TAI, start", "37 s ahead"),
+        ("civil time", "local"),
         ("Image created time", "made"),
     ],
 )
@@ -227,9 +237,10 @@ def test_a_length_is_in_the_unit_that_the_header_states(cards, comment, exposure
 @pytest.mark.parametrize(
     "cards",
     [
-        *({key: 10} for key in ("COADDS", "NCOADD", "NFRAMES", "NSTACK", "LIGH_CNT", "LUM_CNT")),
+        *({key: 10} for key in ("COADDS", "NCOADD", "NFRAMES", "NSTACK", "LIGH_CNT", "LUM_CNT", "NSUBEXP")),
         {"IMCMB001": "a.fits", "IMCMB002": "b.fits"},
         {"IMAGETYP": "Master Light"},
+        {"IMAGETYP": "masterLight"},
         {"IMAGETYP": "stacked"},
     ],
 )

@@ -104,11 +104,11 @@ UNMEASURED = {
 def test_a_claim_holds_whatever_temperatures_are_measured(when):
     """A level of 20 arcsec a C that cools by 6 C an hour; GNSS goes after half an hour."""
     nees = []
-    for seed in range(4):
+    for seed in range(2):
         drive = GnssDrive(stops=60, cooling_c_per_hour=6.0, errors=WARM, unmeasured=UNMEASURED[when])
         told, _ = driven(drive, seed, gnss_until_s=1800.0)
         nees += [frame.nees for frame in after(told, 5400.0) if frame.error_m is not None]
-    assert len(nees) > 100 and np.mean(nees) < 4
+    assert len(nees) > 50 and np.mean(nees) < 4
 
 
 @pytest.mark.parametrize("every_s", [300.0, 400.0, 600.0, 1200.0])

@@ -10,6 +10,7 @@ import pytest
 
 from starpos import rotation
 from starpos.detection import detect
+from starpos.fix import blind as fix_blind
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
@@ -79,7 +80,7 @@ def test_frames_of_any_scale_are_found(field_deg, limit_mag, solver, catalogue, 
     assert found >= 2
 
 
-@pytest.mark.parametrize("off", [0.85, 1.0, 1.15])
+@pytest.mark.parametrize("off", [0.85, 1.15])
 def test_a_focal_length_that_is_roughly_known_comes_first(off, solver, catalogue, rng, monkeypatch):
     """EXIF's: rounded, or of a lens that breathes. Where a frame is found near it no other scale is searched."""
     tried, all_of = [], blind.focal_lengths
@@ -96,7 +97,7 @@ def test_a_focal_length_that_is_roughly_known_comes_first(off, solver, catalogue
             assert all(longest < 1.5 * shortest for shortest, longest in tried)
 
 
-@pytest.mark.parametrize("off", [0.1, 0.5, 3.0, 1e6])
+@pytest.mark.parametrize("off", [0.1, 3.0, 1e6])
 def test_a_wrong_focal_length_of_exif_costs_time_only(off, solver, catalogue, rng):
     xy, axis, focal_px = seen(catalogue, 13.0, 7.5, rng)
     s = solver.identify(replace(listed(xy), rough_focal_px=off * focal_px))
@@ -155,6 +156,14 @@ def test_a_search_ends_with_its_time_and_says_how_to_go_on(catalogue, rng):
     assert s.status is Status.NOT_IDENTIFIED and "in 1 s of CPU" in s.message and "--search-time" in s.message
     assert time.process_time() - begin < 4
     assert said and all(0 <= done <= 1 for done in said)
+
+
+def test_building_the_quads_takes_no_time_of_the_search(solver, catalogue, rng, monkeypatch):
+    order, quads_of, limit_of = [], fix_blind.cached_quads, fix_blind.CpuLimit.of
+    monkeypatch.setattr(fix_blind, "cached_quads", lambda *given: order.append("quads") or quads_of(*given))
+    monkeypatch.setattr(fix_blind.CpuLimit, "of", lambda *given: order.append("limit") or limit_of(*given))
+    xy, _, _ = seen(catalogue, 8.0, 8.5, rng)
+    assert solver.identify(listed(xy)).ok and order[:2] == ["quads", "limit"]
 
 
 def test_at_any_scale_the_quads_of_a_frame_are_those_of_the_sky(catalogue, rng):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import InstrumentError
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.instrument import MIN_UNKNOWN_PX, Calibration, Instrument, with_frame_size
 
 KNOWN = Calibration.of((0.0, 0.0, 0.0), (5.0, 5.0, 5.0))
@@ -87,6 +87,17 @@ def test_a_size_that_is_of_whole_frames_and_of_parts_is_told_and_widens_nothing(
     assert f"frames of {size[0]} x {size[1]} px count as whole ones" in said and "width, height" in said
     stated = Instrument(900.0, calibration=KNOWN, frame_size=size)
     assert [with_frame_size(i, frame(*size))[1] for i in (stated, Instrument(900.0))] == ["", ""]
+
+
+def test_a_fisheye_that_is_cut_out_shows_its_axis_and_has_its_own_camera():
+    cut = frame(2832, 2832, (math.nan, math.nan))
+    instrument, _ = with_frame_size(Instrument(970.0, model=EQUIDISTANT), cut)
+    assert math.radians(1.5) < instrument.axis_stddev_rad < math.radians(3)
+    # a camera of just this size was calibrated with pictures that are cut out alike
+    camera = Camera.from_focal(2832, 2832, 970.0, EQUIDISTANT)
+    calibrated = Instrument(970.0, camera=camera)
+    assert calibrated.camera_for(2832, 2832, cut.origin_px) is camera
+    assert calibrated.whole_of(camera, cut.origin_px) is camera
 
 
 def test_nothing_is_said_where_the_size_is_known_or_a3_is_not():

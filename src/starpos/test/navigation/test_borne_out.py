@@ -8,7 +8,6 @@ import pytest
 from scipy.stats import multivariate_normal
 from voyage_calls import navigated, nees, sigma_m
 
-from starpos.errors import VoyageError
 from starpos.navigation.evidence import independent_means
 from starpos.navigation.vessel import LAWS
 from starpos_testing.voyages import made, turbulent_wind, walking_wind
@@ -77,31 +76,8 @@ def test_a_steady_wind_is_not_believed_to_stay_so():
     assert law.rest_stddev < 0.5 * LAWS["drone"].rest_stddev
 
 
-@cache
-def known_steady():
-    return navigated(voyage_in(None, 5)[0], "drone", velocity=False, drift_change=0.03)
-
-
-def test_a_wind_that_is_known_to_be_steady_narrows_the_claim():
-    record, usual = voyage_in(None, 5)
-    known = known_steady()
-    assert sigma_m(known) < 0.4 * sigma_m(usual) and nees(known, record) < 16
-
-
-def test_a_wind_that_is_wrongly_said_to_be_steady_widens_the_claim_all_the_same():
+def test_a_wind_that_changes_more_than_the_law_says_widens_the_claim():
     record = made("drone", 900, 4, rate_hz=25, cadence_s=3.0, more_wind=walking_wind(0.05))
-    wrong = navigated(record, "drone", velocity=False, drift_change=0.03)
-    assert any("change" in fault for fault in wrong.faults)
-    assert sigma_m(wrong) > 5 * sigma_m(known_steady())
-
-
-@pytest.mark.parametrize("vehicle", ["rover", "parked"])
-def test_what_stands_on_the_ground_has_no_drift_to_change(vehicle):
-    with pytest.raises(VoyageError, match="neither carries"):
-        navigated(made("parked", 30, 1, rate_hz=25), vehicle, velocity=False, drift_change=0.1)
-
-
-@pytest.mark.parametrize("change", [0.0, -0.1, np.inf])
-def test_a_change_of_the_wind_that_cannot_be_is_told(change):
-    with pytest.raises(VoyageError, match="finite number above 0"):
-        navigated(made("parked", 30, 1, rate_hz=25), "drone", velocity=False, drift_change=change)
+    walking = navigated(record, "drone", velocity=False)
+    assert any("change" in fault for fault in walking.faults)
+    assert sigma_m(walking) > 1.5 * sigma_m(voyage_in(None, 5)[1])

@@ -8,11 +8,12 @@ from starpos.errors import FrameError
 from starpos.night import horizon
 
 
-def frames(rng, ground, number, hidden=0.05):
+def frames(rng, ground, number, hidden=0.05, margin=None):
     """Frames of stars all over the sky, of which those above the ground are seen, but for a hidden share."""
     azimuth, altitude = rng.uniform(0, 360, number), np.degrees(np.arcsin(rng.uniform(0, 1, number)))
     seen = (altitude > ground(azimuth)) & (rng.uniform(0, 1, number) > hidden)
-    parts = (np.array_split(c, 5) for c in (azimuth, altitude, seen))
+    margin = np.full(number, 20.0) if margin is None else margin
+    parts = (np.array_split(c, 5) for c in (azimuth, altitude, seen, margin))
     return [horizon.Expected(*columns) for columns in zip(*parts, strict=True)]
 
 
@@ -32,6 +33,14 @@ def test_trees_are_found_and_no_sky_is_called_ground(rng, tmp_path):
     horizon.write(tmp_path / "h.csv", np.column_stack([azimuth, altitude]))
     read = horizon.read(str(tmp_path / "h.csv"))
     assert np.abs(read[:, 1] - altitude).max() < 0.06
+
+
+def test_stars_that_the_air_dims_are_no_ground(rng):
+    # by 1 mag at 13 deg, with 0.3 mag per air mass: lower ones of this margin may be missed under any sky
+    dimmed = frames(rng, lambda azimuth: 12 + 0 * azimuth, 20_000, margin=np.full(20_000, 2.5))
+    assert np.nanmax(horizon.horizon(dimmed, 0.3)[:, 1]) < 2
+    assert np.nanmax(horizon.horizon(dimmed)[:, 1]) < 2
+    assert np.nanmedian(horizon.horizon(dimmed, 0.0)[:, 1]) > 11
 
 
 def test_where_few_stars_have_passed_the_horizon_is_not_known(rng, tmp_path):

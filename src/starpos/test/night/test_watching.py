@@ -41,6 +41,8 @@ def month(rng, wander, knock=None, nights=30):
                 optics=optics,
                 focal_px=1,
                 limit_mag=5,
+                extinction=np.nan,
+                extinction_sigma=np.nan,
                 sky_mag=21,
             )
         )
@@ -58,6 +60,11 @@ def test_a_knock_is_found_the_same_night_and_none_is_invented(wander, rng):
             assert found[knock].moved_arcsec == pytest.approx(180, abs=5 * found[knock].sigma_arcsec)
     # neither too small nor too large
     assert 0.8 < np.std(sigmas) < 1.2
+
+
+def test_a_post_that_wanders_far_is_no_alarm():
+    months = [kept(month(np.random.default_rng(k), 35 * ARCSEC)) for k in range(20)]
+    assert sum(night.alarm for nights in months for night in nights) == 0
 
 
 def test_the_brightness_of_the_sky_by_its_stars(rng):

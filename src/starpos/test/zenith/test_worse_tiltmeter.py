@@ -11,7 +11,7 @@ from sessions import AS_STATED, INSTRUMENT, MARK, SCALE, VACUUM, Worse, drawn
 from starpos.errors import FixError
 from starpos.zenith.doubts import checked_session, remarks
 
-SESSIONS = 15
+SESSIONS = 10
 NOISE, DRIFT, LOOSE = Worse(noise=3), Worse(drift=5), Worse(scale=10)
 
 

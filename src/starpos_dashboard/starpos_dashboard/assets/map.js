@@ -6,7 +6,7 @@ import { add, element, say } from "/page.js";
 import { graticule, label } from "/graticule.js";
 import * as text from "/text.js";
 
-const { geoOrthographic, geoPath, geoDistance, geoGraticule10 } = window.d3;
+const { geoOrthographic, geoPath, geoDistance } = window.d3;
 
 const EARTH_M = 6371008.8; // mean radius
 const NEAREST = 0.01; // m a pixel
@@ -17,7 +17,6 @@ const BIGGEST_M = 8e6; // of an ellipse that can be drawn
 const CORNERS = 90;
 const FILL = 0.62; // of the smaller half of the view, which the ellipse takes at most
 const BAR_PX = 140;
-const SIDE = 118; // of the inset
 const RAD = Math.PI / 180;
 
 export class EarthMap {
@@ -47,7 +46,6 @@ export class EarthMap {
     }
     this.gnss = layer("path", { class: "gnss", id: "map-gnss", d: "M0-8L8 0L0 8L-8 0Z" });
     this.ray = add(this.ellipses.newest.group, "path", { class: "ray", d: "M0-9V-44" });
-    this._inset();
     this._listen();
     new ResizeObserver(() => this.draw()).observe(this.box);
   }
@@ -84,7 +82,6 @@ export class EarthMap {
     this._drawEllipse("average", this.data.average);
     this._drawGnss();
     this._drawScale();
-    this._drawInset();
     this._describe();
   }
 
@@ -242,28 +239,6 @@ export class EarthMap {
     const place = fix ? `${text.sexagesimal(fix.latitude, "NS")}, ${text.sexagesimal(fix.longitude, "EW")}` : "";
     const said = fix ? `map ${across} across, ${this.data.old ? "last" : "newest"} fix at ${place}` : "no position yet";
     this.svg.setAttribute("aria-label", said);
-  }
-
-  // the globe in the corner -------------------------------------------------------------------------------------------
-
-  _inset() {
-    this.inset = element("map-inset");
-    this.inset.setAttribute("viewBox", `0 0 ${SIDE} ${SIDE}`);
-    this.insetPaths = ["sphere", "land", "graticule"].map((name) => add(this.inset, "path", { class: name }));
-    add(this.inset, "circle", { class: "here", cx: SIDE / 2, cy: SIDE / 2, r: 4 });
-  }
-
-  _drawInset() {
-    const shown = this.width * this.perPx < 3e6 && Math.min(this.width, this.height) > 260;
-    this.inset.classList.toggle("hidden", !shown);
-    const { lon, lat } = this.view;
-    const turned = [lon.toFixed(1), lat.toFixed(1)].join();
-    if (!shown || turned === this._insetAt) return;
-    this._insetAt = turned;
-    const globe = geoOrthographic().rotate([-lon, -lat]).scale(SIDE / 2 - 2).translate([SIDE / 2, SIDE / 2]);
-    [{ type: "Sphere" }, this.land, geoGraticule10()].forEach((shape, i) => {
-      this.insetPaths[i].setAttribute("d", geoPath(globe)(shape) ?? "");
-    });
   }
 
   // hands -------------------------------------------------------------------------------------------------------------
