@@ -259,7 +259,7 @@ def _of_all(by: Sequence[np.ndarray], terms: Sequence[tuple[ErrorTerm, ...]]) ->
     return found
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Between:
     """Two bodies under a level, put into the sky as well as their distance goes.
 
@@ -276,7 +276,7 @@ class _Between:
 
     @classmethod
     def of(cls, looks: list[_Look], g: np.ndarray, air: Atmosphere, frame: str) -> "_Between":
-        """By C's rotation g (3, 3) into the level's axes; PlaceError for bodies too low."""
+        """Fit both bodies; g (3, 3): C into the level's axes.  PlaceError for bodies too low."""
         raised = np.array([g @ look.seen.ray for look in looks])
         if raised[:, 2].min() < MIN_COS_ZENITH:
             raise PlaceError(f"{frame}: by the level one of its two bodies is below {MIN_DEG:.0f} deg")
@@ -296,7 +296,7 @@ class _Between:
         errors = [row @ s.own for row, s in zip(along, seen, strict=True)]
         lens = sum(row @ s.lens for row, s in zip(along, seen, strict=True))
         sigma = np.linalg.norm(np.concatenate([*errors, lens, [b.sigma for b in bodies]]))
-        return cls(raised, there, sky, variances, a4, float(sigma))
+        return cls(raised=raised, there=there, sky=sky, variances=variances, a4=a4, sigma=float(sigma))
 
     @property
     def angles(self) -> tuple[float, float]:
@@ -585,7 +585,7 @@ class _Sighted:
         state: EarthState,
         stamp_s: float,
     ) -> "_Sighted":
-        """By C's rotation g (3, 3) into axes whose third is up."""
+        """Return the body over its place; g (3, 3): C into axes whose third is up."""
         a4, moved = place.plumb_axes, zenith_moved(place.plumb[0])
         bent, raised, true = _seen_from(look.body, solver.atmosphere, a4, stars.place)
         components, local = _across(bent), g @ look.seen.ray

@@ -72,10 +72,10 @@ ZENITH_MOVED = 1e-3
 STANDING_SIGMA, TRIAL_SIGMA = 2e-3, 5e-3
 # of a chi-squared of three degrees of freedom: the median, and what one in a million exceeds
 MEDIAN_OF_CHI2, OUTLIER_CHI2 = 2.366, 30.7
-# a disc is the Sun if a lamp, which stands still, is so many sigma away, and the Sun nearer: chi-squared of three degrees
-# of freedom that one in a thousand exceeds
+# A disc is the Sun if a lamp, which stands still, is farther away than this in sigma, and the Sun nearer: chi-squared of
+# three degrees of freedom that one in a thousand exceeds
 LAMP_SIGMAS, SUN_CHI2 = 5.0, 16.3
-# with a wrong heading places or velocities scatter by more than so many times the stated variances
+# with a wrong heading places or velocities scatter by more than this factor, in variances
 MISFIT = 1.5
 # 1 sigma of a further constant of which nothing is known
 UNKNOWN = 100.0
@@ -227,9 +227,9 @@ class Adjustment:
     def _check_sun(self, motion: Motion, chain: Chain, stars: StarAttitudes) -> None:
         """Raise VoyageError unless the disc moves as the Sun and not as a lamp, which stands still.
 
-        Fitted at once: the share of the Sun's way in the sky that the disc stays behind, 0 for the Sun and 1 for what is
-        fixed to the ground; how much higher it is, and how far aside, which the vehicle's own way shows.  Where stars are
-        in the window their heading tells a lamp.
+        Three constants are fitted.  The first is the share of the Sun's way in the sky that the disc stays behind: 0 for
+        the Sun, 1 for what is fixed to the ground.  The others are its height above the Sun and its azimuth, which the
+        vehicle's own way shows.  Stars in the window make that unnecessary.
         """
         lone = ~stars.whole
         if not lone.any():

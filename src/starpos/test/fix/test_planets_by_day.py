@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Venus and Jupiter by day beside the Sun or the Moon: a point that stands where one must; directions by astropy."""
+"""Venus and Jupiter by day, near the Sun or the Moon: a point that stands where one must; directions by astropy."""
 
 import warnings
 from dataclasses import replace

@@ -132,7 +132,7 @@ def test_a_drive_by_day_has_headings_within_their_claims_and_no_fix(model, known
     ("higher_deg", "away_m"), [(8.0, np.inf), (1.4, np.inf), (0.3, np.inf), (0.0, 250.0), (-0.5, 2000.0)]
 )
 def test_a_lamp_gives_no_heading(model, higher_deg, away_m):
-    """As high as the Sun it is told by the sky's turn, and nearby by the vehicle's way."""
+    """The sky's turn shows one as high as the Sun, the vehicle's way one nearby."""
     record = drive(2)
     lamps = lamps_of(record, higher_deg, away_m)
     events = without(record, "attitude", "velocity") + by_day(record, lamps=lamps) + gnss(record)
