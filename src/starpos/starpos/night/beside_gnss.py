@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A night beside GNSS: what its places teach, and each frame compared with them."""
+"""A night compared with GNSS: what its places teach, and how each frame agrees with them."""
 
 from collections import Counter
 from collections.abc import Sequence
