@@ -31,7 +31,7 @@ COMMANDS = {
     "satellites": "a position from satellites among the stars and their orbits, without a level",
     "altaz": "azimuth and altitude of any pixel of a frame at a known place, and pixels of directions",
     "mount": "the axis about which a mount turned, against the pole; a horizontal circle's orientation",
-    "report": "a night on one page: stability, scatter, residuals, sky, error budget",
+    "report": "nights on one page: stability, scatter, residuals, sky, error budget",
     "simulate": "write a night of frames and tilts from a place you choose",
     "demo": "draw a night at a hidden place, find it, and show it on a page, by the commands you would type",
     "catalogue": "describe the star catalogue, or take another one",

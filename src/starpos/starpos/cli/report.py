@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos report`: the results of a night as pictures, and as one page that any browser opens."""
+"""`starpos report`: the results of nights as pictures, and as one page that any browser opens."""
 
 import argparse
 import time
 from importlib.util import find_spec
 from pathlib import Path
 
-from starpos.cli import console, inputs, options
+from starpos.cli import console, inputs, options, overwriting, places_file
+from starpos.cli.fix_output import json_of
+from starpos.cli.solve import read_receiver
 from starpos.errors import FrameError, InstrumentError
 from starpos.frames.reading import are_photographs
+from starpos.night.night import Night
 from starpos.night.opening import exposures, frames_in
 from starpos.night.reading import First, Instruments
 from starpos.night.solving import Exposures, How, solved_night
@@ -26,45 +29,91 @@ def run(args: argparse.Namespace) -> int:
             f"-p {wrong[0]}: a report has the solver's values from its other options, such as --misalignment; -p takes "
             "NODE:NAME:=VALUE of detector and inclinometer"
         )
-    paths = [Path(name) for name in args.night]
-    photographs = are_photographs(paths) and all(path.is_file() for path in paths)
-    if len(paths) > 1 and not photographs:
-        raise FrameError(f"{paths[1]}: a report is of one night: give one, or photographs")
+    if args.gnss is not None and len(args.nights) > 1:
+        raise InstrumentError("--gnss is of one night: give one")
     if args.field is not None:
-        return _pack(args, paths)
+        return _pack(args)
+    if places_file.is_places(args.out):
+        return _write_places(args)
     if find_spec("matplotlib") is None:
         raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {inputs.PIP}")
     from starpos.report.html import PAGE, check_folder, write_files
-    from starpos.report.page import page, pictures_of
+    from starpos.report.page import nights_picture, page, pictures_of
     from starpos.report.photograph import named_photograph
 
     out = Path(args.out)
     folder, index = (out.parent, out.name) if out.suffix.lower() in PAGES else (out, PAGE)
     check_folder(folder, index)
-    how = How(options.turn_of(args) if args.self_calibrate else None)
-    night = solved_night(_exposures(paths, args), how, console.ProgressBar())
-    for sentence in filter(None, (*night.remarks, night.why_not)):
-        console.complain(f"{night.name}: {sentence}")
-    pictures = list(pictures_of(night, catalogue.load_catalogue()))
-    if photographs and (named := named_photograph(night, {p.name: p for p in paths})):
-        pictures.insert(1, named)
-    html = page(night, pictures, utc_text(time.time())[:16].replace("T", " ") + " UTC")
+    groups = _groups(args.nights)
+    nights = _nights(groups, args)
+    bar, each = console.ProgressBar(), []
+    for k, (night, paths) in enumerate(zip(nights, groups, strict=True)):
+        each.append(list(pictures_of(night, catalogue.load_catalogue())))
+        if are_photographs(paths) and (named := named_photograph(night, {p.name: p for p in paths})):
+            each[-1].insert(1, named)
+        bar("figures", (k + 1) / len(nights))
+    known = [(k, n) for k, n in enumerate(nights, 1) if n.truth and n.combined]
+    overall = [nights_picture(known)] if len(nights) > 1 and known else []
+    html = page(nights, each, overall, _now_text())
+    files = {f"{p.name}.png": p.png for p in overall}
+    for k, pictures in enumerate(each, 1):
+        prefix = f"night{k}-" if len(nights) > 1 else ""
+        files |= {f"{prefix}{p.name}.png": p.png for p in pictures}
     # the page has its pictures
-    files = {f"{p.name}.png": p.png for p in pictures} if folder == out else {}
-    write_files(folder, files | {index: html.encode(errors="replace")})
+    write_files(folder, ({} if folder != out else files) | {index: html.encode(errors="replace")})
     print(folder / index)
-    return 0 if night.combined else console.NOTHING
+    return 0 if any(n.combined for n in nights) else console.NOTHING
 
 
-def _pack(args: argparse.Namespace, paths: list[Path]) -> int:
-    """Write a field report."""
+def _groups(names: list[str]) -> list[list[Path]]:
+    """The paths of each night: a folder or a bag, or photographs named one by one."""
+    paths = [Path(name) for name in names]
+    return [paths] if are_photographs(paths) and all(p.is_file() for p in paths) else [[p] for p in paths]
+
+
+def _nights(groups: list[list[Path]], args: argparse.Namespace) -> list[Night]:
+    """The nights, after complaints about what is wrong with them."""
+    nights = [_night(paths, args) for paths in groups]
+    for night in nights:
+        for sentence in (*night.remarks, *([night.why_not] if night.why_not else [])):
+            console.complain(f"{night.name}: {sentence}")
+    return nights
+
+
+def _write_places(args: argparse.Namespace) -> int:
+    """Write the places of nights for maps, without a page."""
+    overwriting.check(args, out=places_file.check_ours)
+    answers: list[dict] = []
+    for night in _nights(_groups(args.nights), args):
+        answers += [{"file": s.name} | json_of(s.place, night.vertical) for _, s in night.fixed]
+        answers.append({"combined": True, "night": night.name} | json_of(night.combined, night.vertical))
+    places_file.write(args.out, answers)
+    print(args.out)
+    return 0 if answers[-1]["utc"] else console.NOTHING
+
+
+def _now_text() -> str:
+    return utc_text(time.time())[:16].replace("T", " ") + " UTC"
+
+
+def _pack(args: argparse.Namespace) -> int:
+    """Write a field report of one night."""
     from starpos.night import field
 
+    if len(args.nights) > 1:
+        raise FrameError("--field packs one night: give one")
     if not args.field.lower().endswith(field.SUFFIX):
         raise FrameError(f"--field {args.field}: give it a name that ends in {field.SUFFIX}")
-    count = field.write(Path(args.field), _exposures(paths, args), console.ProgressBar())
+    count = field.write(Path(args.field), _exposures([Path(args.nights[0])], args), console.ProgressBar())
     print(f"{args.field}: {count} frames")
     return 0
+
+
+def _night(paths: list[Path], args: argparse.Namespace) -> Night:
+    """The Night of a folder, a bag or photographs; raises StarposError if there is nothing to work on."""
+    receiver = read_receiver(args.gnss, None)
+    how = How(options.turn_of(args) if args.self_calibrate else None, receiver)
+    return solved_night(_exposures(paths, args), how, console.ProgressBar())
 
 
 def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
@@ -75,6 +124,8 @@ def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
     if not path.exists():
         raise FrameError(f"{path}: there is no such night: give a folder, a rosbag2, or photographs")
     if bag.is_bag(path):
+        if args.gnss is not None:
+            raise FrameError(f"{path}: --gnss goes with a folder of frames, and this is a bag: leave it out")
         return bag.exposures(*inputs.read_bag(path, args), air, vertical)
     frames = paths if path.is_file() else []
     if frames and not are_photographs(frames):

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos satellites`: a place from satellites among the stars, without a level."""
+"""`starpos satellites`: a place from satellites among the stars, without a level, and which hour shows most of them."""
 
 import argparse
 import json
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from starpos.cli import console, inputs
+from starpos.cli import console, inputs, options
 from starpos.earth.gravity import itrs_place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
@@ -25,10 +26,11 @@ from starpos.night.work import OnFile, TrailSighted
 from starpos.satellites.adjustment import KnownBefore
 from starpos.satellites.elements import Orbit, chosen, read_orbits
 from starpos.satellites.locating import SatelliteFix, locate
+from starpos.satellites.planning import HourOfSatellites, nights_hours
 from starpos.satellites.sightings import read_iod, read_sightings
 from starpos.satellites.trails import SatelliteTrail
 from starpos.sky import catalogue
-from starpos.units import utc_text
+from starpos.units import unix_of, utc_text
 
 # of a height that is stated without an error
 HEIGHT_STDDEV_M = 50.0
@@ -47,6 +49,10 @@ class SeenTrails:
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.plan is not None:
+        return plan(args)
+    if not args.sightings or not args.elements:
+        raise SatelliteError("give frames or sightings and --elements, or --plan LAT LON")
     seen = SeenTrails()
     frames = [path for path in args.sightings if Path(path).suffix.lower() not in TABLES]
     for path in args.sightings:
@@ -227,3 +233,56 @@ def fix_json(fix: SatelliteFix) -> dict:
         if a.scale == 1
         else f"ok; the residuals are larger than stated, the covariance is {a.scale:.1f} times",
     }
+
+
+def plan(args: argparse.Namespace) -> int:
+    """Print the dark hours of the coming 24, and which of them shows most."""
+    begin = time.time() if args.at is None else unix_of(args.at)
+    orbits: list[Orbit] = []
+    if args.elements:
+        orbits, about = chosen(_orbits(args.elements), begin, newer=args.newer_elements)
+        console.complain(*about)
+    lens = None
+    if args.size is not None:
+        focal_px = options.instrument_of(args, None).focal_px
+        width, height = (2 * math.degrees(math.atan(side / 2 / focal_px)) for side in args.size)
+        lens = width, height
+    latitude, longitude = args.plan
+    if not (abs(latitude) <= 90 and abs(longitude) <= 360):
+        raise SatelliteError(f"--plan {latitude:g} {longitude:g}: give latitude and longitude in deg")
+    hours = nights_hours(latitude, longitude, begin, orbits, least_deg=args.min_altitude, lens_deg=lens)
+    if not hours:
+        console.complain("the Sun does not sink 6 deg below the horizon there in these 24 hours")
+        return 1
+    most = max(hours, key=lambda h: h.at_once if lens is None else h.in_lens)
+    for hour in hours:
+        best = bool(orbits) and hour is most
+        console.tell(
+            args, plan_json(hour, lens is not None) | {"best": best}, plan_line(hour, lens is not None, best)
+        )
+    return 0
+
+
+def plan_json(hour: HourOfSatellites, lens: bool) -> dict:
+    """An hour for --json."""
+    return {
+        "utc": utc_text(hour.utc_unix_s),
+        "sun_deg": hour.sun_deg,
+        "lit_from_km": hour.lit_from_km,
+        "satellites": hour.numbers,
+        "at_once": hour.at_once,
+        "in_lens": hour.in_lens if lens else None,
+        "azimuth": hour.towards[0] if lens else None,
+        "altitude": hour.towards[1] if lens else None,
+    }
+
+
+def plan_line(hour: HourOfSatellites, lens: bool, best: bool) -> str:
+    """Return the same for people."""
+    line = (
+        f"{utc_text(hour.utc_unix_s)} Sun {hour.sun_deg[0]:.0f} to {hour.sun_deg[1]:.0f} deg, overhead in sunlight from "
+        f"{hour.lit_from_km:.0f} km: {len(hour.numbers)} satellites, {hour.at_once:.1f} at a time"
+    )
+    if lens:
+        line += f", {hour.in_lens:.2f} in the lens at azimuth {hour.towards[0]:.0f} altitude {hour.towards[1]:.0f}"
+    return f"{line}, the best hour" if best else line

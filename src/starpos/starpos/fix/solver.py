@@ -54,7 +54,7 @@ from starpos.identification.search import (
 from starpos.identification.triangles import TriangleCatalogue, cached_triangles
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.inclinometer import EITHER_WAY, Tilt
-from starpos.instrument.instrument import OWN_LEVEL, UNKNOWN_CLOCK_S, ByGravity, Instrument
+from starpos.instrument.instrument import FISHEYE_AXIS, OWN_LEVEL, UNKNOWN_CLOCK_S, ByGravity, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
@@ -115,11 +115,6 @@ HourByLens = Callable[[Stars, Identification, Camera, Catalogue, Atmosphere, Pla
 
 ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 130.0
-
-
-# A fisheye of which only the focal length is known misplaces stars by about this, outwards: it cancels where they lie all
-# around, and not where a mask leaves one side.
-NOMINAL_LENS_RAD = 0.002
 
 
 @dataclass(frozen=True)
@@ -379,11 +374,7 @@ class Solver:
         about = self.circumstances(stars, camera.scaled(found.focal_scale), state)
         uncalibrated = fisheye.is_wide(camera) and not any(camera.distortion)
         if uncalibrated:
-            off = matched.xy - [camera.cx, camera.cy]
-            # how far they lie on one side of the axis, from 0 to 1
-            aside = float(np.hypot(*off.mean(0)) / max(np.hypot(*off.T).mean(), 1e-9))
-            lens = NOMINAL_LENS_RAD * aside
-            about = replace(about, axis_stddev=math.hypot(about.axis_stddev, lens))
+            about = replace(about, axis_stddev=max(about.axis_stddev, FISHEYE_AXIS))
         attitude = attitude_at_place(matched, place, about)
         shown = attitude.hour_shown or self._hour_at_horizon(stars, found, camera, state, up)
         if not shown and self.hour_by_lens is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a night: its place, its frames, and the sky that it saw."""
+"""Figures of a night: its place, its frames, the drive next to GNSS, and the sky that it saw."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state
+from starpos.earth.place import Place
 from starpos.fix.fix import PlaceFix
 from starpos.fix.solution import FieldPointing
+from starpos.gnss.solving import Watched
+from starpos.gnss.watch import GnssStatus
 from starpos.instrument.camera import Camera
 from starpos.night.night import Night, Shot
 from starpos.report import measures
@@ -18,7 +21,7 @@ from starpos.report.measures import Stability
 from starpos.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, figures_of, number_axis, plain
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.site import Site
-from starpos.units import ARCSEC, utc_text
+from starpos.units import ARCSEC, HOUR_S, utc_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -183,6 +186,29 @@ def _shares(place: PlaceFix, night: Night) -> dict[str, np.ndarray]:
     return shares
 
 
+def draw_nights(figure: "Figure", nights: Sequence[tuple[int, Night]]) -> None:
+    """Draw the errors of latitude and longitude in arcsec of numbered nights; at least one with a place and a truth."""
+    known = [(k, n.combined, n.truth) for k, n in nights if n.combined and n.truth]
+    number = [k for k, _, _ in known]
+    error = np.array([measures.error_arcsec(place, truth) for _, place, truth in known])
+    sigma = np.array([measures.sigma_arcsec(place) for _, place, _ in known])
+    panels = figure.subplots(2, 1, sharex=True)
+    for k, (axes, name, paper) in enumerate(
+        zip(panels, ("latitude", "longitude"), measures.PAPER_NIGHTS, strict=True)
+    ):
+        plain(axes)
+        axes.axhline(0, color=GREY, lw=0.8)
+        axes.axhspan(-paper, paper, color=GREY, alpha=0.1, lw=0, label="the paper's mean absolute error")
+        axes.errorbar(number, error[:, k], sigma[:, k], fmt="o", color=BLUE, ms=5, ecolor=SKY, elinewidth=1.5)
+        reach = 1.15 * max(paper, (np.abs(error[:, k]) + sigma[:, k]).max())
+        mean = figures_of(np.abs(error[:, k]).mean())
+        axes.set_title(f"{name}: mean absolute error {mean}″ (the paper's {paper:.1f}″)", fontsize=10)
+        axes.set(ylim=(-reach, reach), ylabel="arcsec")
+    panels[0].legend(loc="upper right", fontsize=8, framealpha=0.9)
+    number_axis(panels[-1], number)
+    panels[-1].set_xlabel("night")
+
+
 def draw_health(figure: "Figure", night: Night) -> None:
     """Draw stars, residual, tilt and working time of every frame against time."""
     shots = night.shots
@@ -257,6 +283,100 @@ def overlaid(night: Night) -> tuple[np.ndarray, np.ndarray, tuple[int, int]] | N
     size = shots[0].size
     alike = [s for s in shots if s.size == size]
     return np.concatenate([s.xy for s in alike]), np.concatenate([s.residual_px for s in alike]), size
+
+
+COLOURS = {
+    GnssStatus.LEARNING: GREY,
+    GnssStatus.AGREES: GREEN,
+    GnssStatus.DOUBTFUL: ORANGE,
+    GnssStatus.DISAGREES: RED,
+}
+
+
+def compared_of(answers: Sequence[Watched]) -> list[Watched]:
+    """The answers to frames with a GNSS place, in the order of their times."""
+    timed = [a for a in answers if a.compared is not None and a.solution.utc_unix_s is not None]
+    return sorted(timed, key=lambda a: a.solution.utc_unix_s or 0.0)
+
+
+def draw_drive(figure: "Figure", answers: Sequence[Watched]) -> None:
+    """Draw both places on a map, their distance over time, and what was learned over time."""
+    timed = sorted(
+        (a for a in answers if a.solution.utc_unix_s is not None), key=lambda a: a.solution.utc_unix_s or 0.0
+    )
+    begin_s = timed[0].solution.utc_unix_s or 0.0
+    hours = np.array([((a.solution.utc_unix_s or 0.0) - begin_s) / HOUR_S for a in timed])
+    above, middle, below = figure.subplots(3, 1, height_ratios=(2.2, 1.1, 1.1))
+    _draw_map(above, timed)
+    _draw_distance(middle, hours, timed)
+    _draw_learned(below, hours, timed)
+    below.sharex(middle)
+    below.set_xlabel("h after the first frame")
+
+
+def _draw_map(axes: "Axes", timed: Sequence[Watched]) -> None:
+    plain(axes)
+    places = [a.compared.place for a in timed if a.compared is not None]
+    grounds = [a.ground for a in timed if a.ground is not None]
+    first = places[0] if places else grounds[0]
+
+    def km(latitude: float, longitude: float) -> np.ndarray:
+        here = Place.on_ellipsoid(*np.degrees([latitude, longitude]).tolist())
+        return here.offset_m(first.latitude, first.longitude) / 1000
+
+    if grounds:
+        stars = np.array([km(g.latitude, g.longitude) for g in grounds])
+        sigma = np.array([np.sqrt(np.diag(g.covariance)[:2]) / 1000 for g in grounds])
+        axes.errorbar(stars[:, 0], stars[:, 1], xerr=sigma[:, 0], yerr=sigma[:, 1], fmt="o", color=BLUE, ecolor=SKY,
+                      ms=3, elinewidth=0.7, alpha=0.8, label="stars, 1 sigma")  # fmt: skip
+    for status, colour in COLOURS.items():
+        which = [a.compared.place for a in timed if a.compared is not None and a.compared.status == status]
+        if which:
+            seen = np.array([km(p.latitude, p.longitude) for p in which])
+            axes.plot(
+                *seen.T,
+                "D",
+                color=colour,
+                ms=4,
+                mec="black",
+                mew=0.4,
+                label=f"GNSS, {status}",
+                zorder=3,
+            )
+    axes.set(xlabel="east, km", ylabel="north, km")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+
+
+def _draw_distance(axes: "Axes", hours: np.ndarray, timed: Sequence[Watched]) -> None:
+    plain(axes)
+    for status, colour in COLOURS.items():
+        rows = [
+            (h, a.compared.distance_m, a.compared.sigma_m)
+            for h, a in zip(hours, timed, strict=True)
+            if a.compared is not None and a.compared.status == status
+        ]
+        if rows:
+            h, distance, sigma = np.array(rows).T
+            axes.errorbar(h, distance, sigma, fmt="o", ms=3, color=colour, elinewidth=0.8, alpha=0.8)
+    axes.set_yscale("log")
+    axes.set_ylabel("GNSS from\nthe stars, m")
+    axes.tick_params(labelbottom=False)
+
+
+def _draw_learned(axes: "Axes", hours: np.ndarray, timed: Sequence[Watched]) -> None:
+    plain(axes)
+    known = [(h, a.learned) for h, a in zip(hours, timed, strict=True) if a.learned is not None]
+    if known:
+        h = [at for at, _ in known]
+        across, about = np.array([learned.a3_stddev_rad for _, learned in known]).T / ARCSEC
+        deflection = np.array([learned.deflection_stddev_rad for _, learned in known]) / ARCSEC
+        axes.plot(h, across, color=BLUE, label="A3 across the plumb line")
+        axes.plot(h, about, color=PURPLE, label="A3 about it")
+        axes.plot(h, deflection, color=GREEN, label="deflection")
+        axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+    axes.set_yscale("log")
+    axes.set_ylabel("learned,\n1 sigma, arcsec")
 
 
 # maximum number of frames shown with outline and stars

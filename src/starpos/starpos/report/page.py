@@ -16,6 +16,8 @@ from starpos.averaging.average import Average
 from starpos.calibration import residual_map
 from starpos.errors import TimeError
 from starpos.fix.fix import PlaceFix, length_text
+from starpos.gnss.solving import Watched
+from starpos.gnss.watch import GnssStatus
 from starpos.night.night import Night, Truth
 from starpos.report import coast, measures, night_figures
 from starpos.report.html import document, figures, sexagesimal, table
@@ -39,6 +41,16 @@ def pictures_of(night: Night, catalogue: Catalogue) -> Iterator[Picture]:
             yield Picture.drawn(*row, simulated=night.simulated)
 
 
+def nights_picture(nights: Sequence[tuple[int, Night]]) -> Picture:
+    """The errors of numbered nights whose truth is known, at least one."""
+    simulated = all(night.simulated for _, night in nights)
+
+    def draw(figure: "Figure") -> None:
+        night_figures.draw_nights(figure, nights)
+
+    return Picture.drawn("nights", "Error of the nights", NIGHTS, 5.0, draw, simulated)
+
+
 def _figures(night: Night, catalogue: Catalogue) -> Iterator[_Figure]:
     draw = night_figures
     if night.fixed:
@@ -50,6 +62,10 @@ def _figures(night: Night, catalogue: Catalogue) -> Iterator[_Figure]:
             yield "sky", title, _sky_caption(), 6.4, lambda f: draw.draw_sky(f, night, catalogue)
     if not night.shots:
         return
+    if night.watched is not None and draw.compared_of(night.watched.answers):
+        answers = night.watched.answers
+        title = "The drive beside GNSS"
+        yield "drive", title, _drive_caption(answers), 8.6, lambda f: draw.draw_drive(f, answers)
     yield "health", "Frame by frame", HEALTH, 6.4, lambda f: draw.draw_health(f, night)
 
 
@@ -103,6 +119,25 @@ HEALTH = (
     "go (clouds, dew), a residual that rises (focus, wind), a tilt that drifts or jumps (the mount), slow "
     "identification."
 )
+DRIVE = (
+    "Above, the stars' own places, each with what was learned before it, and the GNSS places in the colour of what the "
+    "guard said. In the middle, how far they are apart; below, how well A3 and the deflection were known. Suspicious: a "
+    "distance that grows evenly (a drag)."
+)
+NIGHTS = (
+    "Combined fix of each night less its truth, astronomic, with the 1 sigma that is claimed. Suspicious: errors beyond "
+    "twice their bars in more than one night of twenty, or all on one side: the calibration has changed."
+)
+
+
+def _drive_caption(answers: Sequence[Watched]) -> str:
+    compared = night_figures.compared_of(answers)
+    alarm = next((a for a in compared if a.compared and a.compared.status == GnssStatus.DISAGREES), None)
+    if alarm is None or alarm.compared is None:
+        told = "No alarm: GNSS never disagreed."
+    else:
+        told = f"Alarm at {utc_text(alarm.solution.utc_unix_s or 0.0)}: {alarm.compared.sentence}."
+    return f"{DRIVE} {told}"
 
 
 def _stability_caption(s: measures.Stability, text: str) -> str:
@@ -161,16 +196,21 @@ LISTED = 200
 REASONS = 5
 
 
-def page(night: Night, pictures: Sequence[Picture], made_utc: str) -> str:
-    """The HTML of a night."""
-    title = f"starpos report: {night.name}"
-    parts = [
-        f"<h1>{escape(title)}</h1>",
-        _place(night),
-        _simulated(night),
-        _summary(night),
-        figures(pictures),
-    ]
+def page(
+    nights: Sequence[Night], each: Sequence[Sequence[Picture]], overall: Sequence[Picture], made_utc: str
+) -> str:
+    """The HTML of nights.
+
+    each: pictures of each night; overall: pictures of all nights together.
+    """
+    title = (
+        f"starpos report: {nights[0].name}" if len(nights) == 1 else f"starpos report: {len(nights)} nights"
+    )
+    parts = [f"<h1>{escape(title)}</h1>", figures(overall)]
+    for number, (night, pictures) in enumerate(zip(nights, each, strict=True), 1):
+        if len(nights) > 1:
+            parts.append(f'<h2 id="night{number}">{number}. {escape(night.name)}</h2>')
+        parts += [_place(night), _simulated(night), _summary(night), figures(pictures)]
     parts.append(
         f"<footer><p>Made by starpos {escape(__version__)} on {escape(made_utc)}, on this machine: nothing left it, and "
         "the page loads nothing. Positions are astronomic unless said otherwise; errors are 1 sigma. The paper is "

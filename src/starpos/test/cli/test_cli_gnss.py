@@ -111,3 +111,26 @@ def test_without_gnss_its_code_is_not_asked_and_no_key_is_new(drive, capsys, mon
     assert run(capsys, *command) == before
     for line in objects(before[1]):
         assert line["status"] == "ok" and "gnss" not in line
+
+
+@pytest.mark.parametrize(
+    ("north_deg", "said"),
+    [(0.0, "No alarm: GNSS never disagreed."), (0.5, "km north of where the stars put us")],
+)
+def test_the_report_draws_the_drive_and_tells_the_alarm(drive, tmp_path, capsys, request, north_deg, said):
+    pytest.importorskip("matplotlib")
+    if not north_deg:
+        request.getfixturevalue("unpainted")
+    rows = (drive / "gnss.csv").read_text().splitlines()[1:]
+    cells = [row.split(",") for row in rows]
+    moved = [",".join([t, str(float(latitude) + north_deg), *rest]) for t, latitude, *rest in cells]
+    gnss, out = tmp_path / "moved.csv", tmp_path / "report"
+    gnss.write_text("\n".join([HEAD, *moved]) + "\n")
+    a3 = ("--misalignment", "1.5", "-2", "130", "--misalignment-stddev", "0.01")
+    status, _, errors = run(capsys, "report", drive, "--gnss", gnss, *AIR, *WIDE, *SENSOR, *a3, "-o", out)
+    assert status == 0, errors
+    page = (out / "index.html").read_text()
+    assert "The drive beside GNSS" in page and said in page
+    # the receiver's own table is no frame
+    assert "bad input" not in page
+    assert not north_deg or (out / "drive.png").stat().st_size > 10_000

@@ -19,6 +19,7 @@ from starpos.instrument.sensors import SCA100T_CALIBRATED
 from starpos.night import opening
 from starpos.report import measures
 from starpos.report.night_figures import draw_budget, draw_scatter
+from starpos.report.page import nights_picture
 from starpos_testing.skies.reports import AIR, KNOWN, PLACE, Page, assert_drawn, run, simulate, solved
 
 pytest.importorskip("matplotlib")
@@ -66,7 +67,8 @@ def drawn(still, touched, tmp_path_factory):
 
 
 def report(capsys, night, out, *more):
-    status, said, errors = run(capsys, "report", night, "-o", out, *KNOWN, *AIR, *more)
+    nights = night if isinstance(night, list) else [night]
+    status, said, errors = run(capsys, "report", *nights, "-o", out, *KNOWN, *AIR, *more)
     return status, (Page(out / "index.html") if said else None), errors
 
 
@@ -184,6 +186,25 @@ def test_self_calibration_is_said(turned, tmp_path, capsys):
     assert "calibrated: the plumb line in the camera is known to" in page.text
     assert any("calibrated: " in line for line in errors)
     assert f"{want['latitude']:+.6f}°, {want['longitude']:+.6f}°" in page.text
+
+
+def test_the_errors_of_several_nights_are_drawn(still, catalogue):
+    night = worked(still)
+    assert_drawn(nights_picture([(1, night), (2, night)]).png)
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_several_nights_are_held_against_their_truths(still, tmp_path, capsys):
+    other = simulate(tmp_path / "other", "--seed", 5, place={"latitude": -33.9, "longitude": 18.4}, frames=2)
+    status, page, errors = report(capsys, [still, other], tmp_path / "out")
+    assert (status, errors) == (0, [])
+    assert "2 nights" in page.text and "Error of the nights" in page.pictures
+    assert {"night1-scatter.png", "night2-scatter.png", "nights.png"} <= {
+        p.name for p in (tmp_path / "out").iterdir()
+    }
+    for night in (still, other):
+        want = solved(capsys, night, *KNOWN, *AIR)
+        assert f"{want['latitude']:+.6f}°, {want['longitude']:+.6f}°" in page.text
 
 
 @pytest.mark.usefixtures("unpainted")

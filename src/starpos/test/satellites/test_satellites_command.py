@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import skies
+from astropy import units as u
+from astropy.coordinates import AltAz, EarthLocation, get_sun
+from astropy.time import Time
 
 from starpos.cli import main
 from starpos.simulation.scene import expose, render, scene_of, write_fits
@@ -99,6 +102,9 @@ def test_a_frame_has_its_heading_at_that_place(night, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
+        (["satellites"], "give frames or sightings and --elements"),
+        (["satellites", "--plan", "95", "0"], "give latitude and longitude"),
+        (["satellites", "--plan", "47", "8", "--size", "100", "100"], "no focal length"),
         (
             [
                 "satellites",
@@ -119,3 +125,40 @@ def test_a_frame_has_its_heading_at_that_place(night, tmp_path, capsys):
 def test_calls_that_cannot_be_answered(night, capsys, words, said):
     assert main([word.format(folder=night[0]) for word in words]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_plan_has_the_dark_hours_and_what_is_high_and_lit(night, capsys):
+    """Against astropy's Sun and a shadow of its own, at the middle of each hour."""
+    folder, records, _ = night
+    begin = "2020-09-13T13:00:00"
+    words = ["satellites", "--plan", 47, 8, "--elements", folder / "active.tle", "--at", begin]
+    status, hours, _ = told(capsys, *words, "--focal-mm", 25, "--pixel-um", 5.86, "--size", 1936, 1216)
+    assert status == 0 and sum(h["best"] for h in hours) == 1
+    site = EarthLocation.from_geodetic(8, 47, 0)
+    every = Time(begin) + np.arange(0, 24, 0.05) * u.hour
+    dark = get_sun(every).transform_to(AltAz(obstime=every, location=site)).alt.deg < -6
+    hours_dark = sorted({t.isot[:13] for t in every[dark]})
+    assert [h["utc"][:13] for h in hours] == hours_dark
+    first = hours[0]
+    middle = Time(first["utc"].rstrip("Z")) + 45 * u.min
+    sun = get_sun(middle).cartesian.xyz.value
+    sun = sun / np.linalg.norm(sun)
+    seen = []
+    for record in records:
+        _, height = skies.sight(record, (47.0, 8.0, 0.0), middle.unix)
+        axes, *_ = skies.surroundings(47.0, 8.0, 0.0, middle.unix)
+        r = axes @ np.array(record.sgp4(middle.jd1, middle.jd2)[1])
+        lit = r @ sun > 0 or np.linalg.norm(r - (r @ sun) * sun) > 6400
+        if height > np.radians(26) and lit:
+            seen.append(record.satnum)
+    assert len(seen) > 3 and set(seen) <= set(first["satellites"])
+    assert len(first["satellites"]) < 150 and 3 < first["at_once"] < 20
+    assert 0 < first["in_lens"] < first["at_once"] and first["altitude"] > 25
+    # later the shadow rises
+    lowest = [h["lit_from_km"] for h in hours]
+    assert lowest[0] < 200 < 1000 < max(lowest)
+
+
+def test_where_it_does_not_get_dark_nothing_is_planned(capsys):
+    assert main(["satellites", "--plan", "75", "20", "--at", "2020-06-21T00:00:00"]) == 1
+    assert "does not sink 6 deg" in capsys.readouterr().err
