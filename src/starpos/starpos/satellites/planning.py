@@ -70,7 +70,7 @@ def nights_hours(
     sky = OrbitsAbove(orbits) if orbits else None
     least = math.sin(math.radians(least_deg))
     steps = math.ceil(begin_unix_s / STEP_S) + np.arange(round(24 * HOUR_S / STEP_S))
-    # by hour, what its dark moments have: sine of the Sun's height, rows seen, their number by pointing
+    # by hour, for its dark moments: sine of the Sun's height, rows seen, their number by pointing
     hours: dict[int, list[tuple[float, np.ndarray, np.ndarray]]] = {}
     for t in (steps * STEP_S).tolist():
         sun = body_at(SUN, earth_state(t)).itrs

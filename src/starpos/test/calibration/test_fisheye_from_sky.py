@@ -133,7 +133,7 @@ def test_a_frame_of_the_middle_of_the_sky_does_not_show_its_hour(catalogue, rng)
     assert math.sqrt(wide.plumb.angles_covariance[0, 0]) > math.radians(5)
     stated = replace(from_files, instrument=replace(solver.instrument, clock_stddev_s=1.0))
     known = answer_frame(stated, Question(item=middle, stars=middle, places=SITE)).solution.at_place
-    assert math.sqrt(known.plumb.angles_covariance[0, 0]) < math.radians(0.1)
+    assert math.sqrt(known.plumb.angles_covariance[0, 0]) < math.radians(0.2)
 
 
 def test_a_frame_of_an_unknown_lens_shows_its_hour_or_claims_to_miss_it(catalogue, rng):
