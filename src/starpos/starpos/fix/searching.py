@@ -307,6 +307,5 @@ def _fitting(solver: Solver, q: Question, progress: Progress) -> Instrument | No
     if focal_px is not None:
         return replace(solver.instrument, focal_px=focal_px)
     blind = BlindSolver(solver.catalogue, progress, search_s=HINT_SEARCH_S)
-    blind.prepare()
     seen = identify_blind_every_way(blind, q.item, q.stars).solution.pointing
     return None if seen is None else replace(solver.instrument, focal_px=seen.focal_px, model=seen.model)
