@@ -170,7 +170,7 @@ def _shade(picture: np.ndarray, seen: _Seen, n: int, ground: np.ndarray) -> None
 def _enlarged(
     frame: Frame, stars: Stars, seen: _Seen, points: np.ndarray, n: int
 ) -> tuple[Frame, Stars, _Seen, np.ndarray]:
-    """The same with n x n pixels for each, so that there is room for names and numbers."""
+    """Enlarge a frame and what lies on it n times, so that there is room for names and numbers."""
     width, height, c = n * frame.width, n * frame.height, seen.camera
     camera = replace(
         c.scaled(n), width=width, height=height, cx=(c.cx + 0.5) * n - 0.5, cy=(c.cy + 0.5) * n - 0.5
