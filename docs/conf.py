@@ -9,11 +9,10 @@ import re
 from pathlib import Path
 
 import starpos
-from starpos.cli import parser_for
-from starpos.cli.commands import commands as all_commands
+from starpos.cli import COMMANDS, parser_for
 
 ROOT = Path(__file__).resolve().parents[1]
-# lines of a docstring that tell of something by its name, in columns or after a colon
+# lines of a docstring that describe something by its name, in columns or after a colon
 COLUMNS, NAMED = re.compile(r"[\w, ]*\w(?: \([^)]*\))? {2,}\S"), re.compile(r"[\w, ]*\w(?: \([^)]*\))?: \S")
 # an entry of a section of numpydoc
 ENTRY = re.compile(r"\*{0,2}\w+(?:, \w+)* : \S")
@@ -66,7 +65,7 @@ def about_names() -> str:
 def about_commands() -> str:
     """What --help says of every command."""
     made = []
-    for name in all_commands():
+    for name in COMMANDS:
         [commands] = (action for action in parser_for([name])._actions if isinstance(action.choices, dict))
         made.append(f"### starpos {name}\n\n```\n{commands.choices[name].format_help()}```\n")
     return "\n".join(made)

@@ -13,7 +13,7 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos_common.messages import camera_to_message
 from starpos_interfaces.srv import SaveCalibration
-from starpos_testing.graph.shots import FULL, FULL_FOCAL_PX, SOLVER, shoot
+from starpos_testing.graph.shots import FULL_FOCAL_PX, SMALL, SOLVER, focal_of, shoot
 from starpos_testing.patience import WAIT_S
 
 KILLS = 40
@@ -105,9 +105,10 @@ def _is_solved(graph) -> bool:
 
 def test_a_camera_killed_while_it_saves_starts_again_with_a_whole_file(graph, run, tmp_path):
     path = tmp_path / "camera.yaml"
-    cameras = [Camera.from_focal(*FULL, FULL_FOCAL_PX * k) for k in (1.0, 1.01)]
+    cameras = [Camera.from_focal(*SMALL, focal_of(SMALL) * k) for k in (1.0, 1.01)]
     instrument_file.write_camera(path, cameras[0], "camera")
-    parameters = ("source:=simulated", "cadence:=100.0", f"calibration_url:={path}")
+    size = (f"simulated.width:={SMALL[0]}", f"simulated.height:={SMALL[1]}")
+    parameters = ("source:=simulated", *size, "cadence:=100.0", f"calibration_url:={path}")
     process = run("starpos_camera", "camera", *parameters)
     client = graph.node.create_client(SetCameraInfo, "camera/set_camera_info")
     graph.wait(client.service_is_ready)

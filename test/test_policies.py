@@ -121,7 +121,7 @@ def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
     sim = "use_sim_time:=true"
     (tmp_path / "active.tle").write_text(orbits.drawn(3, 1, time.time() - 3600)[1])
     elements = f"satellites.elements:={tmp_path / 'active.tle'}"
-    secured("starpos_solver", "solver", sim, elements)
+    secured("starpos_solver", "solver", sim, "gyro:=true", elements)
     secured("starpos_solver", "navigator", sim, "publish_tf:=true")
     secured("starpos_camera", "camera", sim, *SKY)
     secured("starpos_camera", "detector", sim, "trails:=true", "day_exposure:=true")

@@ -92,7 +92,7 @@ def test_the_instrument_that_ros2_launch_starts_gives_its_place(demo, fixes):
 
 
 @needs("ros2launch")
-@pytest.mark.parametrize("name", ["starpos", "robot", "replay", "demo"])
+@pytest.mark.parametrize("name", ["starpos", "instruments", "replay", "demo"])
 def test_ros2_launch_reads_every_launch_file(name):
     words = ["ros2", "launch", "starpos_bringup", f"{name}.launch.py", "--show-args"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=WAIT_S, check=False)

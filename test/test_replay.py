@@ -120,6 +120,12 @@ def test_the_kept_script_makes_this_bag(tmp_path, truth):
     made, kept = (
         yaml.safe_load((folder / "metadata.yaml").read_text()) for folder in (tmp_path / "night", NIGHT)
     )
+    # the kept one is of the first release: its Tilt, and so Solution, had no third axis, the others no shutter
+    for about in (made, kept):
+        for topic in about["rosbag2_bagfile_information"]["topics_with_message_count"]:
+            kind = topic["topic_metadata"]["type"].removeprefix("starpos_interfaces/msg/")
+            if kind in ("Tilt", "Solution", "Capture", "StarArray"):
+                del topic["topic_metadata"]["type_description_hash"]
     assert made == kept
 
 

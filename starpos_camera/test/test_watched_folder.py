@@ -17,7 +17,7 @@ from sensor_msgs.msg import Image
 from starpos.errors import FrameError, StarposError
 from starpos.simulation.scene import write_fits
 from starpos_camera.sources import files
-from starpos_camera.sources.files import IDLE_S, MAX_LOOKED_AT, PATIENCE, Files, WatchedFolder
+from starpos_camera.sources.files import MAX_LOOKED_AT, PATIENCE, Files, WatchedFolder
 from starpos_camera.sources.source import CaptureError, CaptureSettings, NothingYet
 from starpos_testing.patience import WAIT_S
 
@@ -81,7 +81,7 @@ def test_what_was_there_is_not_new_and_what_comes_is_taken_once(watch):
     # Not at rest yet.
     assert watch.look() is None
     assert watch.take() == ["a.fits"]
-    assert watch.take() == watch.take(IDLE_S) == []
+    assert watch.take() == watch.take(60.0) == []
 
 
 def test_many_at_once_come_in_the_order_of_their_times_then_of_their_names(watch):
@@ -185,19 +185,6 @@ def test_a_disk_that_is_unmounted_and_mounted_again_is_not_taken_for_new(watch, 
     assert watch.take() == ["b.fits"]
     record_property("fault", "watched disk unmounted and mounted again")
     record_property("result", "what came meanwhile is taken, nothing twice")
-
-
-def test_a_folder_at_rest_is_not_listed(watch, monkeypatch):
-    listed, real = [], os.listdir
-    monkeypatch.setattr(os, "listdir", lambda path: listed.append(path) or real(path))
-    # The last doubt about what came in the folder's last tick.
-    watch.look(10.0)
-    listed.clear()
-    for _ in range(50):
-        watch.look(1.0)
-    assert len(listed) <= 1
-    watch.look(2 * IDLE_S)
-    assert len(listed) <= 2
 
 
 def test_listing_a_huge_folder_takes_a_tenth_of_the_time(watch, monkeypatch):

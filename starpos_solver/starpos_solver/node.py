@@ -11,13 +11,14 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo, NavSatFix
+from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from starpos.instrument.camera import Camera
 from starpos.session import reports
 from starpos.session.driver import Output, Sent
 from starpos.session.gnss import GNSS_TOPIC, ComparedPlaces
+from starpos.session.gyro import IMU_TOPIC
 from starpos.session.session import CAMERA_TOPIC, SolverSession
 from starpos.session.settings import Settings
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_simulated
@@ -26,7 +27,7 @@ from starpos_common.worker import JobRunner
 from starpos_interfaces import msg
 from starpos_interfaces.srv import Solve
 from starpos_solver.calibration_services import CalibrationServices
-from starpos_solver.driver import Inputs, NodeLog, declared, now_of
+from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, declared, now_of
 from starpos_solver.publishing import SolutionPublishers, StaticTransforms
 
 POLL_S = 0.02
@@ -46,11 +47,12 @@ class SolverNode(Node):
         declared(self, "solver", self._settings, self._apply, self._camera)
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        gyro = (IMU_TOPIC,) * self._values["gyro"]
         orbits = self._settings.orbits is not None
         trails, gnss = ("trails",) * orbits, (GNSS_TOPIC,) * (self._values["gnss.use"] and not orbits)
         # at a known place a heading needs no tilt
         tilt = ("tilt",) * (self._settings.site is None and not gnss)
-        self._inputs = Inputs(self, ("camera_info", "stars", *trails, *tilt, *gnss))
+        self._inputs = Inputs(self, ("camera_info", "stars", *trails, *tilt, *gyro, *gnss))
         self._dropped = Dropped(self, PLAY_SLOWER)
         self._session = SolverSession(
             self._settings,
@@ -82,6 +84,9 @@ class SolverNode(Node):
             take = self._taker("trails", lambda m, _: session.receive_trails(m, now_of(self)))
             subscription(self, msg.TrailArray, "trails", take, 10)
         self._again = self.create_guard_condition(self._go_on)
+        if self._values["gyro"]:
+            best_effort = ReliabilityPolicy.BEST_EFFORT
+            subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
         self._gnss = ComparedPlaces()
         taught = self._taker(GNSS_TOPIC, lambda m, _: session.receive_gnss(m, now_of(self)))
         hear = self._compare_gnss if session.gnss is None else taught
@@ -89,6 +94,7 @@ class SolverNode(Node):
         subscription(self, NavSatFix, GNSS_TOPIC, hear, 10, ReliabilityPolicy.BEST_EFFORT)
         self.create_service(Solve, "~/solve", self._on_solve)
         self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(Trigger, "~/deflection", self._on_deflection)
         self._calibration_services = CalibrationServices(self, self._session, self._settings)
         group = MutuallyExclusiveCallbackGroup()
         self._poll = self.create_timer(
@@ -108,6 +114,8 @@ class SolverNode(Node):
             tasks["GNSS"] = session.gnss.report
         if session.satellites is not None:
             tasks["Satellites"] = session.satellites.report
+        if session.deflection.measures:
+            tasks["Deflection"] = session.deflection.report
         self._diagnostics = Diagnostics(self, tasks, self._values["frame_id"])
         self._update_transforms()
 
@@ -134,6 +142,9 @@ class SolverNode(Node):
 
     def _compare_gnss(self, message: NavSatFix) -> None:
         self._gnss.receive(message, now_of(self))
+
+    def _on_imu(self, message: Imu) -> None:
+        self._session.gyro.receive(message, now_of(self))
 
     def _note_dropped(self, name: str, info: Mapping[str, Any]) -> None:
         if time_is_simulated(self):
@@ -197,6 +208,16 @@ class SolverNode(Node):
         self._session.reset()
         response.success = True
         response.message = "tilts, frames and the place are forgotten; a calibration that was found is not"
+        return response
+
+    def _on_deflection(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if not self._session.deflection.measures:
+            response.message = (
+                "no deflection is measured: start the solver with deflection.wanted, a site and altitude"
+            )
+            return response
+        told = self._session.deflection.report()
+        response.success, response.message = told.level == Level.OK, told.message
         return response
 
     # diagnostics -----------------------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ import ast
 import doctest
 import inspect
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -20,7 +19,6 @@ from starpos_testing.voyages import made
 
 SOURCE = Path(starpos.__file__)
 README = SOURCE.resolve().parents[1] / "README.md"
-BAG = SOURCE.resolve().parents[3] / "test" / "data" / "night"
 
 
 def said(program: str) -> str:
@@ -92,18 +90,20 @@ def test_the_doors_own_example_is_what_comes_of_it(night, monkeypatch):
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory, catalogue):
     """A folder with all files that the examples of the public names read."""
+    from starpos.cli import main
+
     folder = tmp_path_factory.mktemp("workplace")
     simulated(folder / "night", "--stars-only", "-n", "5")
     simulated(folder / "turn", "--stars-only", "-n", "8", "--turn", "45")
     known = starpos.Calibration.of((0, 0, 0), (5, 5, 5))
     instrument = starpos.Instrument(4635.9375, calibration=known, inclinometer=SCA100T_CALIBRATED)
     starpos.write_instrument(folder / "instrument.yaml", instrument)
+    told = ["--field", str(folder / "night.zip"), "--instrument", str(folder / "instrument.yaml")]
+    assert main(["report", str(folder / "night"), *told]) == 0
     for name in ("drive", "zenith"):
         (folder / name).mkdir()
     write_drive(folder / "drive", catalogue, made("rover", 40, 2, cadence_s=4.0))
     write_zenith_session(folder / "zenith", catalogue)
-    if BAG.is_dir():
-        shutil.copytree(BAG, folder / "bag")
     rows = "".join(f"{1.8e9 + k},35.7046,51.4106,2.0,2.0\n" for k in range(3))
     (folder / "gnss.csv").write_text("utc_unix_s,latitude,longitude,sigma_east_m,sigma_north_m\n" + rows)
     return folder
@@ -112,10 +112,6 @@ def workplace(tmp_path_factory, catalogue):
 @pytest.mark.parametrize("name", starpos.__all__)
 def test_the_example_of_a_public_name_is_what_comes_of_it(name, workplace, monkeypatch):
     monkeypatch.chdir(workplace)
-    if name in ("PlayedNight", "replay"):
-        pytest.importorskip("rosbags")
-        if not BAG.is_dir():
-            pytest.skip("the recorded night is not beside this package")
     thing = getattr(starpos, name)
     text = inspect.getdoc(thing)
     for title in () if inspect.isclass(thing) else ("Parameters", "Returns"):

@@ -37,7 +37,7 @@ def nodes(told):
     return [
         launching.process("starpos_camera", "detector", common, every, remaps=frames),
         launching.process("starpos_inclinometer", "inclinometer", common, source, remaps=imu),
-        launching.process("starpos_solver", "solver", common, every, remaps=camera_info),
+        launching.process("starpos_solver", "solver", common, every, remaps=camera_info | imu),
         *launching.dashboard(told, common, every),
     ]
 

@@ -1,36 +1,112 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A rosbag2 by `rosbags`, with the message types of this workspace: read and written."""
+"""A rosbag2 by `rosbags`, with the message types of this workspace: read, brought up to date, and written."""
 
+import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ament_index_python.packages import get_package_share_directory
 
 from starpos.errors import BagError
-from starpos.recording.bag import BagReader, installed_types
+from starpos.recording.bag import PACKAGE, BagReader, installed_types
 from starpos.recording.topics import IMU_DATA, NO_REMAPS, RAW, Remaps, driver_topics
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection, Qos
+    from rosbags.typesys.store import Typestore
+
+Appended = dict[str, dict[str, Any]]
+
+SHUTTER = {"shutter_known": False, "readout": 0.0, "readout_stddev": 0.0}
+# Fields added at the end of types, each with its value for unknown: newest first, last the fields that the first release
+# lacked.
+VERSIONS: tuple[Appended, ...] = (
+    {f"{PACKAGE}/msg/Solution": {"warnings": []}},
+    {
+        f"{PACKAGE}/msg/Tilt": {"z": math.nan, "z_variance": math.nan},
+        f"{PACKAGE}/msg/Capture": SHUTTER,
+        f"{PACKAGE}/msg/StarArray": SHUTTER,
+    },
+)
+APPENDED: Appended = {name: fields for version in VERSIONS for name, fields in version.items()}
+
+
+class OlderTypes:
+    """The types of APPENDED as earlier versions had them."""
+
+    def knows(self, type_name: str, digest: str) -> bool:
+        """Whether a type with this hash is one of them."""
+        return self._store_of(type_name, digest) is not None
+
+    def upgraded(self, data: bytes, type_name: str, digest: str) -> bytes:
+        """The bytes of such a message as the type of today has them; as they are if they are broken."""
+        store = self._store_of(type_name, digest)
+        if store is None:
+            return data
+        try:
+            message = self._completed(store.deserialize_cdr(data, type_name), type_name)
+            return bytes(self._now.serialize_cdr(message, type_name))
+        except Exception:
+            # hostile bytes may cause any error of a conversion; the player reports that they are broken
+            return data
+
+    def _completed(self, message: Any, type_name: str) -> Any:
+        given = vars(message)
+        for name, (_, about) in self._now.fielddefs[type_name][1]:
+            if about in APPENDED:
+                given[name] = self._completed(given[name], about)
+        return self._now.types[type_name](**APPENDED[type_name] | given)
+
+    def _store_of(self, type_name: str, digest: str) -> "Typestore | None":
+        if type_name not in APPENDED:
+            return None
+        return next((s for s in self._then if s.hash_rihs01(type_name) == digest), None)
+
+    @cached_property
+    def _now(self) -> "Typestore":
+        return installed_types()
+
+    @cached_property
+    def _then(self) -> "list[Typestore]":
+        """The types before each of VERSIONS."""
+        stores = []
+        for k in range(len(VERSIONS)):
+            store = installed_types()
+            for version in VERSIONS[: k + 1]:
+                for type_name, appended in version.items():
+                    constants, fields = store.fielddefs.pop(type_name)
+                    store.register({type_name: (constants, [f for f in fields if f[0] not in appended])})
+            stores.append(store)
+        return stores
+
 
 TYPE_NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
 
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of a bag: message class and name of its type; latched: late subscribers get the last message too."""
+    """One topic of a bag: message class and name of its type; latched: late subscribers get the last message too.
+
+    older: hash of its type, if that is one of an earlier version: its messages are upgraded; '' for the type of today.
+    """
 
     name: str
     kind: type
     type_name: str
     latched: bool
+    older: str
 
 
 class Bag(BagReader):
     """A bag to play; everything in it is checked before it is used."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._older = OlderTypes()
 
     def inputs(self, needed: str, others: tuple[str, ...], remaps: Remaps = NO_REMAPS) -> list[str]:
         """Find the topics of these relative names in any namespace, or the topics of a robot's own camera and IMU.
@@ -64,7 +140,7 @@ class Bag(BagReader):
             if c.topic == "/clock" or (wanted and c.topic not in wanted):
                 continue
             try:
-                topics[c.id] = _topic(c)
+                topics[c.id] = _topic(c, self._older)
             except BagError as error:
                 left_out(f"{self.path}: {c.topic!r} is left out: {error}")
         if not topics:
@@ -74,10 +150,15 @@ class Bag(BagReader):
     def played(self, topics: dict[int, Topic]) -> Iterator[tuple[Topic, int, bytes]]:
         """Read (topic, log time in ns, bytes) in the bag's order; raises BagError if the file breaks off."""
         for connection, log_ns, data in self.messages([c for c in self.connections if c.id in topics]):
-            yield topics[connection.id], log_ns, data
+            topic = topics[connection.id]
+            yield (
+                topic,
+                log_ns,
+                self._older.upgraded(data, topic.type_name, topic.older) if topic.older else data,
+            )
 
 
-def _topic(connection: "Connection") -> Topic:
+def _topic(connection: "Connection", older: OlderTypes) -> Topic:
     """Make the topic of a connection; raises BagError if its type is not installed here, or differs."""
     from rclpy.exceptions import InvalidTopicNameException
     from rclpy.validate_full_topic_name import validate_full_topic_name
@@ -88,13 +169,15 @@ def _topic(connection: "Connection") -> Topic:
         raise BagError("it is no topic's name") from None
     kind = _message_class(connection.msgtype)
     known = _type_hash(connection.msgtype)
-    if connection.digest.startswith("RIHS01_") and known and connection.digest != known:
+    differs = connection.digest.startswith("RIHS01_") and bool(known) and connection.digest != known
+    known_then = differs and older.knows(connection.msgtype, connection.digest)
+    if differs and not known_then:
         raise BagError(
             f"its {connection.msgtype} differs from the one installed here: use the version it was recorded with"
         )
     durabilities = [q.durability.name for q in getattr(connection.ext, "offered_qos_profiles", ())]
     latched = bool(durabilities) and all(name == "TRANSIENT_LOCAL" for name in durabilities)
-    return Topic(connection.topic, kind, connection.msgtype, latched)
+    return Topic(connection.topic, kind, connection.msgtype, latched, connection.digest if known_then else "")
 
 
 def _message_class(name: str) -> type:

@@ -19,11 +19,14 @@ def is_true(told: Mapping[str, str], name: str) -> bool:
         raise LaunchError(f"{name}:={told[name]}: give true or false") from None
 
 
-def name_of(told: Mapping[str, str], name: str) -> str:
-    """Read an argument that names a namespace; LaunchError if it is no valid one."""
-    found = told[name].strip().strip("/")
-    if not re.fullmatch(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", found, re.ASCII):
-        raise LaunchError(f"{name}:={told[name]}: give a name such as stars")
+def names(told: Mapping[str, str], name: str) -> list[str]:
+    """Read an argument of names of namespaces, separated by commas; LaunchError if one is invalid, or comes twice."""
+    found = [word.strip().strip("/") for word in told[name].split(",")]
+    sound = all(re.fullmatch(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", word, re.ASCII) for word in found)
+    if not sound or len(set(found)) < len(found):
+        raise LaunchError(
+            f"{name}:={told[name]}: give different names separated by commas, such as left,right"
+        )
     return found
 
 

@@ -16,7 +16,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.substitutions import FindPackageShare
 
-from starpos_bringup.launch_arguments import LaunchError, is_true, name_of, one_of
+from starpos_bringup.launch_arguments import LaunchError, is_true, names, one_of
 
 if TYPE_CHECKING:
     from launch import LaunchDescriptionEntity
@@ -76,7 +76,7 @@ class Common:
             raise LaunchError(f"params_file:={told['params_file']}: there is no such file")
         respawn = is_true(told, "respawn") if "respawn" in told else False
         level = one_of(told, "log_level", LOG_LEVELS)
-        outputs = name_of(told, "outputs") if told["outputs"] else ""
+        outputs = names(told, "outputs")[0] if told["outputs"] else ""
         return cls(str(path), level, told["enclaves"].rstrip("/"), respawn, outputs)
 
 
@@ -120,13 +120,18 @@ INSTRUMENT = (
 )
 
 
-def instrument(common: Common, parameters: Mapping[str, Mapping] = {}) -> list[Node]:
-    """Make the processes of an instrument; parameters of its nodes as in `process`."""
+def instrument(
+    common: Common, parameters: Mapping[str, Mapping] = {}, defaults: Mapping[str, Mapping] = {}
+) -> list[Node]:
+    """Make the processes of an instrument; parameters and defaults of its nodes as in `process`."""
 
-    def of(nodes: Sequence[str]) -> dict[str, Mapping]:
-        return {name: values for name, values in parameters.items() if name in ("**", *nodes)}
+    def of(nodes: Sequence[str], every: Mapping[str, Mapping]) -> dict[str, Mapping]:
+        return {name: values for name, values in every.items() if name in ("**", *nodes)}
 
-    return [process(package, executable, common, of(nodes)) for package, executable, nodes in INSTRUMENT]
+    return [
+        process(package, executable, common, of(nodes, parameters), defaults=of(nodes, defaults))
+        for package, executable, nodes in INSTRUMENT
+    ]
 
 
 def process(
@@ -135,16 +140,17 @@ def process(
     common: Common,
     parameters: Mapping[str, Mapping] = {},
     arguments: Sequence[str] = (),
+    defaults: Mapping[str, Mapping] = {},
     remaps: Mapping[str, str] = {},
     **options: Any,
 ) -> Node:
     """Make a process.
 
-    parameters: of its nodes, by name ('**' is all); the parameter file counts less.
-    remaps: topics by the names that the nodes know them by.
+    parameters, defaults: of its nodes, by name ('**' is all); the parameter file counts less than parameters, more
+    than defaults.  remaps: topics by the names that the nodes know them by.
     """
     renamed = [word for name, topic in remaps.items() for word in ("-r", f"{name}:={topic}")]
-    files = [common.params_file, _written(parameters)]
+    files = [_written(defaults), common.params_file, _written(parameters)]
     return Node(
         package=package,
         executable=executable,

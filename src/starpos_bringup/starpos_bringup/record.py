@@ -4,10 +4,12 @@
 import argparse
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starpos.cli.commands import Command, rows_of
+from starpos.cli.commands import Command
 from starpos.errors import BagError
+from starpos.parameters.table import rows_of
 from starpos_bringup.bag import BagWriter
 
 if TYPE_CHECKING:
@@ -60,7 +62,7 @@ def record() -> int:
 
 def parser_of(executable: str) -> argparse.ArgumentParser:
     """The parser of an executable of this package, from its row."""
-    row = rows_of("executables.yaml", __package__)[executable]
+    row = rows_of(Path(__file__).with_name("data") / "executables.yaml")[executable]
     return Command(**row).define(argparse.ArgumentParser(prog=executable))
 
 

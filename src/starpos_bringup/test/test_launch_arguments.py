@@ -3,7 +3,7 @@
 
 import pytest
 
-from starpos_bringup.launch_arguments import LaunchError, is_true, name_of, number, one_of
+from starpos_bringup.launch_arguments import LaunchError, is_true, names, number, one_of
 
 
 @pytest.mark.parametrize("text", ["abc", "", "nan", "90.5", "inf"])
@@ -12,11 +12,11 @@ def test_what_is_no_number_in_its_range_is_named_with_its_argument(text):
         number({"latitude": text}, "latitude", -90, 90)
 
 
-def test_the_name_of_a_namespace_is_read():
-    assert name_of({"outputs": "/left/stars"}, "outputs") == "left/stars"
-    for text in ("", "left,right", "1st", "le ft", "left//right"):
-        with pytest.raises(LaunchError, match=f"outputs:={text}: give a name"):
-            name_of({"outputs": text}, "outputs")
+def test_names_of_instruments_are_read_and_none_comes_twice():
+    assert names({"instruments": "left, right/upper"}, "instruments") == ["left", "right/upper"]
+    for text in ("", "left,", "left,left", "1st", "le ft", "left//right"):
+        with pytest.raises(LaunchError, match=f"instruments:={text}: give different names"):
+            names({"instruments": text}, "instruments")
 
 
 def test_a_word_is_one_of_those_that_there_are():

@@ -21,12 +21,13 @@ INSTRUMENT = ["camera_detector", "inclinometer", "solver"]
 
 @dataclass(frozen=True)
 class Process:
-    """A process that would be started; parameters by node, from files after the user's."""
+    """A process that would be started; parameters by node, from files before and after the user's."""
 
     namespace: str
     executable: str
     words: list[str]
     user_file: str
+    less: dict[str, dict]
     more: dict[str, dict]
     respawn: bool
     on_exit: Any
@@ -61,6 +62,7 @@ def process_of(action, context) -> Process:
         executable=Path(executable).name,
         words=words,
         user_file=users,
+        less=parameters(files[:place]),
         more=parameters(files[place + 1 :]),
         respawn=action._ExecuteLocal__respawn,
         on_exit=action._ExecuteLocal__on_exit,
@@ -105,7 +107,7 @@ def test_the_instrument_takes_the_arguments_it_names():
     silent = started("starpos")
     assert list(silent) == INSTRUMENT
     # What is not given, the file says.
-    assert all(p.more == {} and p.namespace == "/" and not p.respawn for p in silent.values())
+    assert all(p.less == p.more == {} and p.namespace == "/" and not p.respawn for p in silent.values())
     assert {Path(p.user_file).name for p in silent.values()} == {"starpos.yaml"}
     told = started(
         "starpos",
@@ -158,6 +160,12 @@ def test_each_process_is_in_its_enclave_of_the_policy(bag):
         ("starpos", {"respawn": "yes"}, "respawn:=yes: give true or false"),
         ("starpos", {"navigator": "yes"}, "navigator:=yes: give true or false"),
         ("starpos", {"dashboard": "yes"}, "dashboard:=yes: give true or false"),
+        ("instruments", {"instruments": "left,left"}, "instruments:=left,left: give different names"),
+        (
+            "instruments",
+            {"instruments": "left", "use_sim_time": "perhaps"},
+            "use_sim_time:=perhaps: give true or false",
+        ),
         ("demo", {"latitude": "abc"}, "latitude:=abc: give a number from -90 to 90"),
         ("demo", {"longitude": "500"}, "longitude:=500: give a number from -180 to 360"),
         ("demo", {"azimuth": "nan"}, "azimuth:=nan: give a number"),
@@ -171,15 +179,54 @@ def test_each_process_is_in_its_enclave_of_the_policy(bag):
         ("replay", {"bag": "/nowhere/night"}, "bag:=/nowhere/night: there is no such bag"),
     ],
 )
-def test_a_wrong_argument_is_refused_in_a_sentence_and_nothing_starts(name, given, words, bag):
-    needed = {"replay": {"bag": bag}}
+def test_a_wrong_argument_is_refused_in_a_sentence_and_nothing_starts(name, given, words, bag, tmp_path):
+    (tmp_path / "robot.yaml").write_text("")
+    needed = {"replay": {"bag": bag}, "instruments": {"params_file": str(tmp_path / "robot.yaml")}}
     with pytest.raises(LaunchError, match=words):
         processes_of(name, **(needed.get(name, {}) | given))
 
 
-def test_what_has_no_default_has_to_be_given():
-    with pytest.raises(RuntimeError, match='"bag" was not provided'):
-        processes_of("replay")
+@pytest.mark.parametrize(
+    ("name", "given", "missing"),
+    [
+        ("replay", {}, "bag"),
+        ("instruments", {"instruments": "left"}, "params_file"),
+        ("instruments", {"params_file": "robot.yaml"}, "instruments"),
+    ],
+)
+def test_what_has_no_default_has_to_be_given(name, given, missing):
+    with pytest.raises(RuntimeError, match=f'"{missing}" was not provided'):
+        processes_of(name, **given)
+
+
+@pytest.mark.parametrize(("above", "root"), [("", ""), ("rover", "/rover")])
+def test_two_instruments_have_namespaces_frames_and_enclaves_of_their_own_and_one_file(above, root, tmp_path):
+    file = tmp_path / "robot.yaml"
+    file.write_text("/left/solver:\n  ros__parameters: {min_stars: 7}\n")
+    both = processes_of(
+        "instruments",
+        instruments="left,right",
+        params_file=str(file),
+        namespace=above,
+        use_sim_time="true",
+        respawn="true",
+    )
+    assert [p.executable for p in both] == 2 * INSTRUMENT
+    for side, instrument in (("left", both[:3]), ("right", both[3:])):
+        for process in instrument:
+            assert process.namespace == f"{root}/{side}"
+            assert process.user_file == str(file) and process.respawn
+            assert process.more == {"/**": {"use_sim_time": True}}
+            assert enclave_of(process) == f"/starpos/{side}/{process.executable}"
+        # the file, which counts more, may name others
+        assert [p.less for p in instrument] == [
+            {f"/**/{node}": {"frame_id": f"{side}_{frame}"}}
+            for node, frame in (
+                ("camera", "starpos_camera_optical_frame"),
+                ("inclinometer", "starpos_inclinometer_frame"),
+                ("solver", "starpos_link"),
+            )
+        ]
 
 
 def test_a_robots_topics_are_remapped_and_its_own_fix_has_another_name():
@@ -196,7 +243,7 @@ def test_a_robots_topics_are_remapped_and_its_own_fix_has_another_name():
             ("imu/data", "imu"),
         )
     )
-    assert remaps == {"detector": [image, info, imu], "inclinometer": [imu], "solver": [info]}
+    assert remaps == {"detector": [image, info, imu], "inclinometer": [imu], "solver": [info, imu]}
     assert robot["inclinometer"].more["/**/inclinometer"] == {"source": "imu"}
     assert {p.namespace for p in robot.values()} == {"/starpos"} and {
         p.user_file for p in robot.values()

@@ -10,8 +10,8 @@ a frame its hardware time, and never gives it a wrong one.
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import takewhile
-from statistics import stdev
+from itertools import pairwise
+from statistics import median, stdev
 
 from starpos.units import SIGMA_PER_MAD
 
@@ -27,8 +27,8 @@ MIN_LENGTH_SPREAD_S, MAX_LENGTH_SPREAD_S = 0.0001, 0.002
 SIGMAS = 4.0
 # Time by which a driver may report the begin of an exposure too late.
 EARLY_S = 0.1
-# Time for which pulses are remembered after their end.
-REMEMBERED_S = 4000.0
+# Number of edges that are remembered: 2000 frames.
+EDGES = 4000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,38 +68,14 @@ class ShutterPulses:
     """Pairs the pulses of one camera's shutter with its frames."""
 
     def __init__(self) -> None:
-        self._pulses: deque[ShutterPulse] = deque()
-        # When edges were lost: from the last one before to the first one after.
-        self._gaps: deque[tuple[float, float]] = deque()
-        self._open: Edge | None = None
-        self._last: Edge | None = None
+        self._edges: deque[Edge] = deque(maxlen=EDGES)
         self._exposure_s = -1.0
         # (lag, length) of frames that had one pulse only.
         self._seen: deque[tuple[float, float]] = deque(maxlen=KEPT)
 
     def record(self, edge: Edge) -> None:
         """Record an edge, in the order of their sequence."""
-        last, self._last = self._last, edge
-        if last is not None and edge.sequence != last.sequence + 1:
-            self._gaps.append((last.time_s, edge.time_s))
-            self._open = None
-        if not edge.rising:
-            if self._open is not None:
-                # It opened unseen in between: it is unknown which of the two closings began a pulse.
-                self._gaps.append((self._open.time_s, edge.time_s))
-            self._open = edge
-        elif self._open is not None:
-            opened, self._open = self._open, None
-            self._pulses.append(
-                ShutterPulse(
-                    begin_s=opened.time_s,
-                    length_s=edge.time_s - opened.time_s,
-                    stddev_s=max(opened.stddev_s, edge.stddev_s),
-                    # a length across two clocks is not valid
-                    disciplined=opened.disciplined and edge.disciplined,
-                )
-            )
-        self._forget(edge.time_s - REMEMBERED_S)
+        self._edges.append(edge)
 
     def pair(self, told_s: float, exposure_s: float, since_s: float, until_s: float) -> ShutterPulse | str:
         """Find the pulse of a frame, or say in a sentence why it has none.
@@ -111,22 +87,25 @@ class ShutterPulses:
             # Another length, and perhaps another mode of the shutter.
             self._seen.clear()
             self._exposure_s = exposure_s
-        begin_s, end_s = max(since_s, told_s - EARLY_S), until_s - exposure_s
-        # The newest are looked at first, and the older ones not at all.
-        near = [
-            p
-            for p in takewhile(lambda p: p.begin_s >= begin_s, reversed(self._pulses))
-            if p.begin_s <= until_s
-        ]
-        if any(a <= until_s for a, _ in takewhile(lambda gap: gap[1] >= begin_s, reversed(self._gaps))):
+        begin_s = max(since_s, told_s - EARLY_S)
+        near = self._around(begin_s, until_s)
+        if any(b.sequence != a.sequence + 1 or a.rising == b.rising for a, b in pairwise(near)):
             return "edges of the shutter were lost near it"
-        if not near:
+        pulses = [(a, b) for a, b in pairwise(near) if b.rising and begin_s <= a.time_s <= until_s]
+        if not pulses:
             return "no pulse of the shutter came between the command and the frame"
-        if len(near) > 1:
-            return f"{len(near)} pulses of the shutter came between the command and the frame"
-        (pulse,) = near
-        if pulse.begin_s > end_s:
+        if len(pulses) > 1:
+            return f"{len(pulses)} pulses of the shutter came between the command and the frame"
+        ((closed, opened),) = pulses
+        if closed.time_s > until_s - exposure_s:
             return "the pulse of the shutter came too late for the exposure to end in time"
+        pulse = ShutterPulse(
+            begin_s=closed.time_s,
+            length_s=opened.time_s - closed.time_s,
+            stddev_s=max(closed.stddev_s, opened.stddev_s),
+            # a length across two clocks is not valid
+            disciplined=closed.disciplined and opened.disciplined,
+        )
         lag_s = pulse.begin_s - told_s
         usual = self._agreeing()
         self._seen.append((lag_s, pulse.length_s))
@@ -141,13 +120,13 @@ class ShutterPulses:
         if not agreeing:
             return None
         lags = [lag for lag, _ in agreeing]
-        return Lag(_median(lags), stdev(lags), len(lags))
+        return Lag(median(lags), stdev(lags), len(lags))
 
     def _agreeing(self) -> list[tuple[float, float]]:
         """Lags and lengths of the frames that agree; empty while they are few, or not the most."""
         if not self._seen:
             return []
-        lag_s, length_s = (_median(values) for values in zip(*self._seen, strict=True))
+        lag_s, length_s = (median(values) for values in zip(*self._seen, strict=True))
         agreeing = [
             (lag, length)
             for lag, length in self._seen
@@ -155,17 +134,22 @@ class ShutterPulses:
         ]
         return agreeing if len(agreeing) >= LEARNED and 2 * len(agreeing) > len(self._seen) else []
 
-    def _forget(self, before_s: float) -> None:
-        while self._pulses and self._pulses[0].begin_s < before_s:
-            self._pulses.popleft()
-        while self._gaps and self._gaps[0][1] < before_s:
-            self._gaps.popleft()
+    def _around(self, begin_s: float, until_s: float) -> deque[Edge]:
+        """The edges between two times, the last one before, and the first one after."""
+        near: deque[Edge] = deque()
+        for edge in reversed(self._edges):
+            if edge.time_s > until_s:
+                near.clear()
+            near.appendleft(edge)
+            if edge.time_s < begin_s:
+                break
+        return near
 
 
 def _doubt(lag_s: float, length_s: float, usual: list[tuple[float, float]]) -> str:
     """Say why a pulse is not the camera's own, by its lag and length compared with the usual ones; '' if it may be."""
     lags, lengths = zip(*usual, strict=True)
-    lag, length = _median(lags), _median(lengths)
+    lag, length = median(lags), median(lengths)
     if abs(lag_s - lag) > _spread(lags, lag, MIN_LAG_SPREAD_S, MAX_LAG_SPREAD_S):
         return f"its pulse came {lag_s:.3f} s after the command where others come after {lag:.3f} s"
     if abs(length_s - length) > _spread(lengths, length, MIN_LENGTH_SPREAD_S, MAX_LENGTH_SPREAD_S):
@@ -175,9 +159,4 @@ def _doubt(lag_s: float, length_s: float, usual: list[tuple[float, float]]) -> s
 
 def _spread(values: Sequence[float], middle: float, least: float, most: float) -> float:
     """How far a value may be from the median; robust, because a wrong one must not open the door to others."""
-    return min(max(SIGMAS * SIGMA_PER_MAD * _median([abs(v - middle) for v in values]), least), most)
-
-
-def _median(values: Sequence[float]) -> float:
-    """Median, of an even number the upper one of the middle two: an order of magnitude faster than `statistics`."""
-    return sorted(values)[len(values) // 2]
+    return min(max(SIGMAS * SIGMA_PER_MAD * median([abs(v - middle) for v in values]), least), most)

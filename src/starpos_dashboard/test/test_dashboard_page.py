@@ -64,6 +64,21 @@ def test_both_places_are_shown_and_what_the_guard_says_of_gnss(page):
     page.shows(gnss_word="agrees")
 
 
+def test_the_place_is_copied_and_opens_in_a_map(page):
+    page.instrument.works(fix=said.fix(-33.92487, 18.42406), fix_averaged=None)
+    link = "return document.getElementById('geo').getAttribute('href')"
+    page.until(lambda: page.run(link) == "geo:-33.924870,18.424060")
+    page.run(
+        "window.addEventListener('copy', (e) => (window.copied = e.clipboardData.getData('text/plain')))"
+    )
+    page.click("copy")
+    assert page.text("copy") == "Copied"
+    assert page.run("return window.copied") == "-33.924870, 18.424060"
+    page.shows(copy="Copy")
+    page.instrument.works(fix=said.fix(math.nan), fix_averaged=None)
+    page.until(lambda: not page.run("return document.getElementById('place-tools').checkVisibility()"))
+
+
 def test_the_needle_points_where_the_heading_is(page):
     tip = """
       const g = document.querySelector("#needle"), m = g.getScreenCTM();
@@ -121,6 +136,14 @@ def test_lights_have_their_colours_words_and_sentences_and_hostile_text_stays_te
     # The icon and the frame.
     assert page.run("return document.images.length") == 2
     assert page.run("return document.querySelectorAll('#lights img, #lights script').length") == 0
+
+
+def test_the_card_of_the_deflection_is_there_while_one_is_measured(page):
+    seen = "return document.getElementById('deflection-card').checkVisibility()"
+    assert not page.run(seen)
+    sentence = "enough; xi +3.120 +- 0.070, eta -1.020 +- 0.080 arcsec, 8 faces, 192 frames"
+    page.instrument.works(__diagnostics=said.diagnostics(("solver: Deflection", 0, sentence)))
+    page.until(lambda: page.run(seen) and sentence in page.text("deflection"))
 
 
 def test_a_node_that_has_never_spoken_is_silent_not_missing(page):

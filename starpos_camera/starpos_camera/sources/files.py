@@ -28,10 +28,6 @@ from starpos_camera.sources.source import (
 )
 from starpos_interfaces.msg import Capture
 
-# More than the coarsest time stamps of folders (FAT: 2 s): a second change within the same tick does not show.
-TICK_S = 3.0
-# Interval at which the folder is listed even if it seems unchanged: some network disks do not update its time.
-IDLE_S = 60.0
 # Largest share of the time for listing.
 LISTING_SHARE = 0.1
 # A file that cannot be read is given up after this multiple of the time of rest.
@@ -53,9 +49,8 @@ class NewFile:
 class WatchedFolder:
     """Finds the new files of a folder, each once, when it is complete; what is there at the first look is not new.
 
-    The folder is polled: network disks send no events. A look costs one stat of the folder and of each file that is being
-    written. The folder is listed only if it has changed, and listing takes at most a tenth of the time. For each file in
-    the folder 8 bytes are kept.
+    The folder is polled: network disks send no events, and some do not update a folder's time. Listing takes at most a
+    tenth of the time. For each file in the folder 8 bytes are kept.
 
     If the folder itself comes later, all its files are new. A name counts once. If another folder takes its place (a
     disk is mounted again), only files newer than the newest one taken so far are new.
@@ -75,9 +70,6 @@ class WatchedFolder:
         self._known: np.ndarray = np.zeros(0, np.int64)
         # The folder's device and inode.
         self._is: tuple[int, int] | None = None
-        # The folder's time, and when it was seen to change.
-        self._modified_ns = 0
-        self._changed_s = -np.inf
         # When the folder was listed last, and how long that took.
         self._listed_s = -np.inf
         self._listing_s = 0.0
@@ -126,14 +118,8 @@ class WatchedFolder:
             if self._newest_ns is None:
                 # All files that come are new.
                 self._newest_ns = 0
-            self._modified_ns = 0
             raise
-        now = self._clock()
-        if status.st_mtime_ns != self._modified_ns:
-            self._modified_ns, self._changed_s = status.st_mtime_ns, now
-        settled = self._listed_s >= self._changed_s + TICK_S
-        idle_s = max(IDLE_S, self._listing_s / LISTING_SHARE**2)
-        if now >= self._listed_s + (idle_s if settled else self._listing_s / LISTING_SHARE):
+        if self._clock() >= self._listed_s + self._listing_s / LISTING_SHARE:
             self._list(status)
         for name, arrival in list(self._arrivals.items())[:MAX_LOOKED_AT]:
             self._follow(name, arrival)

@@ -194,29 +194,25 @@ class ShutterTimes:
             self._changed.wait_for(lambda: self._over_since(since_s), self._patience_s)
             found = self._pulses.pair(told_s, frame.exposure_s, since_s, until_s)
             self._lag = self._pulses.lag
-        curtain_s, curtain_stddev_s = self._values["pulses.curtain"], self._values["pulses.curtain_stddev"]
-        middle_s = frame.exposure_s / 2 - curtain_s
+        source, clock_s, remark = exposure.stamp_source, frame.clock_stddev_s, exposure.remark
         if isinstance(found, ShutterPulse):
             self.paired += 1
-            self.unpaired = ""
-            clock_s = RECEIVER_STDDEV_S if found.disciplined else frame.clock_stddev_s
-            known = replace(
-                frame,
-                mid_unix_s=found.begin_s + middle_s,
-                stamp_stddev_s=math.hypot(found.stddev_s, curtain_stddev_s),
-                clock_stddev_s=clock_s,
-            )
-            return replace(exposure, frame=known, stamp_source=Capture.HARDWARE)
-        self.unpaired = found
-        remark = exposure.remark or f"a frame has no time of its shutter: {found}."
-        if self._lag is None or self._lag.frames < ENOUGH_FOR_LAG:
-            return replace(exposure, remark=remark)
+            self.unpaired, source = "", Capture.HARDWARE
+            begin_s, stddev_s = found.begin_s, found.stddev_s
+            clock_s = RECEIVER_STDDEV_S if found.disciplined else clock_s
+        else:
+            self.unpaired = found
+            remark = remark or f"a frame has no time of its shutter: {found}."
+            if self._lag is None or self._lag.frames < ENOUGH_FOR_LAG:
+                return replace(exposure, remark=remark)
+            begin_s, stddev_s = told_s + self._lag.median_s, self._lag.stddev_s
         known = replace(
             frame,
-            mid_unix_s=told_s + self._lag.median_s + middle_s,
-            stamp_stddev_s=math.hypot(self._lag.stddev_s, curtain_stddev_s),
+            mid_unix_s=begin_s + frame.exposure_s / 2 - self._values["pulses.curtain"],
+            stamp_stddev_s=math.hypot(stddev_s, self._values["pulses.curtain_stddev"]),
+            clock_stddev_s=clock_s,
         )
-        return replace(exposure, frame=known, remark=remark)
+        return replace(exposure, frame=known, stamp_source=source, remark=remark)
 
     def values(self) -> dict[str, object]:
         """What diagnostics show."""

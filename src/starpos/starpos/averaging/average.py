@@ -239,10 +239,8 @@ def average(fixes: Sequence[Fix]) -> Average:
 
     Examples
     --------
-    >>> solver = starpos.Solver(starpos.read_instrument("instrument.yaml"), starpos.load_catalogue())
-    >>> tilts = starpos.read_tilt_csv("night/tilt.csv")
-    >>> lists = [starpos.read_frame(path) for path in sorted(Path("night").glob("stars_*.csv"))]
-    >>> starpos.average([solver.solve(stars, tilts).fix for stars in lists]).frames
+    >>> solutions = starpos.replay("night.zip").solutions
+    >>> starpos.average([solution.fix for solution in solutions]).frames
     5
     """
     different = {(f.utc_unix_s, f.latitude, f.longitude): f for f in fixes}.values()

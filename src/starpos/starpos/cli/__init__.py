@@ -14,11 +14,31 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from starpos import __version__
-from starpos.cli.commands import check_call, commands
 from starpos.errors import StarposError
 from starpos.parallel import BLAS_THREADS
 
 BAD_CALL = 2
+# the commands in the order of --help, which needs nothing else of them
+COMMANDS = {
+    "solve": "position and heading of frames with their tilts",
+    "navigate": "position, heading and velocity of a voyage: frames and an IMU, while driving, sailing, flying",
+    "detect": "the stars of frames",
+    "identify": "where frames look, lost in space",
+    "replay": "solve recorded nights (rosbag2) with the solver's own code: the same fixes as in the running graph",
+    "calibrate": "A3 at a known place, or the camera, from identified stars",
+    "deflection": "deflection of the vertical at a known site, from a zenith camera's frames and tilts",
+    "stations": "many sessions of starpos deflection: repeats, differences from a geoid grid, GeoJSON",
+    "satellites": "a position from satellites among the stars and their orbits, without a level",
+    "altaz": "azimuth and altitude of any pixel of a frame at a known place, and pixels of directions",
+    "mount": "the axis about which a mount turned, against the pole; a horizontal circle's orientation",
+    "report": "nights on one page: stability, scatter, residuals, sky, error budget",
+    "simulate": "write a night of frames and tilts from a place you choose",
+    "demo": "draw a night at a hidden place, find it, and show it on a page, by the commands you would type",
+    "catalogue": "describe the star catalogue, or take another one",
+    "montecarlo": "identify random fields, and count successes: the paper's table",
+    "first-night": "focus, exposure, level, clock, signs, A3 by turning: step by step, live, until it is saved",
+    "doctor": "which parts that starpos needs this machine has, which are missing, and what to type",
+}
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -56,9 +76,10 @@ def parser_for(given: Sequence[str]) -> CommandParser:
     )
     parser.add_argument("--version", action="version", version=f"starpos {__version__}")
     choice = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, command in commands().items():
-        sub = choice.add_parser(name, help=command.text)
+    for name, text in COMMANDS.items():
+        sub = choice.add_parser(name, help=text)
         if given and given[0] == name:
+            command = import_module("starpos.cli.commands").command_of(name)
             command.define(sub, import_module(f"starpos.cli.{name.replace('-', '_')}"))
     return parser
 
@@ -120,7 +141,7 @@ def _run(args: argparse.Namespace, complain: Callable[[object], None]) -> int:
             # not for each command: it loads what reads instruments
             if getattr(args, "instrument", None) is not None:
                 import_module("starpos.cli.options").fill_site(args)
-            check_call(args)
+            import_module("starpos.cli.commands").check_call(args)
             status: int = args.run(args)
         # a reader that has gone must be noticed here, and not while the interpreter ends
         sys.stdout.flush()

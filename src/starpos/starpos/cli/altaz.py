@@ -12,7 +12,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.cli import console, inputs, options, overwriting
-from starpos.cli.commands import rows_of
+from starpos.cli.commands import DATA
 from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, InstrumentError
 from starpos.files import save
@@ -23,6 +23,7 @@ from starpos.fix.searching import Sight
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import Camera
 from starpos.night import horizon
+from starpos.parameters.table import rows_of
 from starpos.tables import TableForm
 from starpos.units import utc_text
 
@@ -140,7 +141,7 @@ def _figures(seen: _Seen) -> Iterator[np.ndarray]:
     """Azimuths and altitudes (N, 2) in deg along the lines of the constellations, above the horizon."""
     at = seen.at_place
     state, to_local = earth_state(at.utc_unix_s), at.place.plumb_axes
-    for lines in rows_of("figures.yaml").values():
+    for lines in rows_of(DATA / "figures.yaml").values():
         for each in lines:
             stars = rotation.unit_vector(*np.radians(np.reshape(each, (-1, 2))).T)
             v = state.to_itrs(stars) @ to_local.T

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands and their options: rows of data/commands.yaml, and groups of options of data/options.yaml."""
+"""The commands and their options: a file data/COMMAND.yaml for each, and groups of options of data/options.yaml."""
 
 import argparse
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cache
-from importlib import resources
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from starpos.cli import COMMANDS
 from starpos.errors import StarposError
+from starpos.parameters.table import rows_of
+
+DATA = Path(__file__).with_name("data")
 
 
 class CallError(StarposError):
@@ -20,7 +22,7 @@ class CallError(StarposError):
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """A command, or a kind of it: a row of commands.yaml, whose keys are these names.
+    """A command, or a kind of it: a file of rows, whose keys are these names.
 
     text         for --help; it begins with a small letter and has no full stop
     description  for its own --help, if it is more than the text
@@ -65,27 +67,16 @@ class Command:
         return parser
 
 
-@cache
-def rows_of(file: str, package: str = "starpos.cli") -> dict[str, Any]:
-    """The rows of a file in a package's folder data."""
-    import yaml
-
-    # PyYAML's parser in C takes a tenth of the time; a build without it is rare
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    rows: dict[str, Any] = yaml.load(resources.files(package).joinpath("data", file).read_bytes(), loader)
-    return rows
-
-
 def check_call(args: argparse.Namespace) -> None:
     """Raise CallError if the options of a call do not go together."""
-    command = commands()[args.command]
+    command = command_of(args.command)
     kind = getattr(args, "kind", None)
     check_options(command.options if kind is None else command.kinds[kind]["options"], args)
 
 
-def commands() -> dict[str, Command]:
-    """The commands by their names, in the order of --help."""
-    return {name: Command(**row) for name, row in rows_of("commands.yaml").items()}
+def command_of(name: str) -> Command:
+    """The command of a name."""
+    return Command(text=COMMANDS[name], **rows_of(DATA / f"{name}.yaml"))
 
 
 def add_options(parser: argparse.ArgumentParser, rows: Mapping[str, dict | None]) -> None:
@@ -147,7 +138,7 @@ def check_options(rows: Mapping[str, dict | None], args: argparse.Namespace) -> 
 def _unfolded(rows: Mapping[str, dict | None]) -> Iterator[tuple[str, dict]]:
     for names, row in rows.items():
         if row is None:
-            yield from _unfolded(rows_of("options.yaml")[names])
+            yield from _unfolded(rows_of(DATA / "options.yaml")[names])
         else:
             yield names, row
 

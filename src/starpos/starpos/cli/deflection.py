@@ -13,10 +13,11 @@ from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, InstrumentError, TiltError
 from starpos.fix.solution import Solution
 from starpos.instrument.instrument import Instrument, with_frame_size
+from starpos.night.at_mark import ZenithSighted
 from starpos.night.bag import each_frame, is_bag
 from starpos.night.reading import First
 from starpos.night.remarks import of_inclinometer
-from starpos.night.work import OnFile, ZenithSighted
+from starpos.night.work import OnFile
 from starpos.units import ARCSEC, utc_text
 from starpos.zenith.adjustment import DeflectionSession, FaceQuality, Reduced, reduced
 from starpos.zenith.doubts import checked_session, remarks

@@ -30,8 +30,6 @@ from starpos.night.remarks import NEAR_KM, Near, of_tilts
 from starpos.night.work import Solving
 from starpos.parallel.processes import Here, Workers, memory_bytes, processors, workers
 from starpos.progress import quiet
-from starpos.recording.drivers import Drivers
-from starpos.recording.topics import remaps_of
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:
@@ -223,6 +221,8 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
     if find_spec("rosbags") is None:
         raise FrameError(f"{path}: bags are read with rosbags, which is not here: {PIP}")
     from starpos.night import bag
+    from starpos.recording.drivers import Drivers
+    from starpos.recording.topics import remaps_of
 
     any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
     drivers = Drivers.of(args.params_file, args.param, args.namespace, remaps_of(args.remap))

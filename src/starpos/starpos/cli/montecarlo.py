@@ -2,16 +2,12 @@
 """`starpos montecarlo`: the paper's table of identified random fields, made by this program."""
 
 import argparse
-import json
-import sys
 from collections.abc import Iterator
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 
-from starpos.cli import console, options, overwriting
-from starpos.errors import FrameError
+from starpos.cli import console, options
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.instrument.camera import Camera
@@ -29,7 +25,6 @@ PAPER_LIMIT_MAG, PAPER_STARS = 9.0, 24.9
 
 
 def run(args: argparse.Namespace) -> int:
-    overwriting.check(args, keep=overwriting.failed_fields)
     camera = options.camera_of(args)
     stars = deeper.for_field(catalogue.load_catalogue(), camera)
     conditions = _conditions(args, stars, camera)
@@ -45,8 +40,6 @@ def run(args: argparse.Namespace) -> int:
             bar(label, done / number)
         wrong += tally.wrong
         _print_row(label, paper, tally, args.json)
-        if args.keep:
-            _keep(tally, conditions, Path(args.keep))
     return int(wrong > 0)
 
 
@@ -121,19 +114,3 @@ def _print_row(label: str, paper: str, t: montecarlo_fields.Tally, as_json: bool
         f"{label:15}{t.fields:8d}{right:30}{t.wrong:6d}{t.none:6d}{median:9.2f}{worst:8.1f}   {paper:>9}",
         flush=True,
     )
-
-
-def _keep(tally: montecarlo_fields.Tally, conditions: montecarlo_fields.Conditions, folder: Path) -> None:
-    """Write the fields that failed as CSV, with their truth in the first line; raises FrameError."""
-    head = {"NAXIS1": conditions.camera.width, "NAXIS2": conditions.camera.height}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for given, verdict in tally.failed:
-            truth = None if given.centre is None else given.centre.tolist()
-            lines = ["# " + json.dumps(head | {"VERDICT": verdict, "CENTRE": truth}), "x,y,flux"]
-            s = given.stars(conditions)
-            lines += [f"{x:.5f},{y:.5f},{flux:.6g}" for x, y, flux in zip(s.x, s.y, s.flux, strict=True)]
-            (folder / f"{given.name.replace(' ', '_')}.csv").write_text("\n".join(lines) + "\n", "utf-8")
-            print(f"{given.name}: {verdict}, {len(given)} stars", file=sys.stderr)
-    except OSError as e:
-        raise FrameError(f"{folder}: cannot be written ({e.strerror}): give another --keep") from None

@@ -2,7 +2,6 @@
 """Files that options name to be written: refused, before the work, if they would replace files of another kind."""
 
 import argparse
-import json
 import os
 import re
 from collections.abc import Callable, Iterator
@@ -21,7 +20,6 @@ INPUTS = ("frames", "tilt", "pointings", "sights", "imu", "geoid", "gaia")
 CAMERA_NAME = "camera"
 # 'a.fits[2]' is an image in the file a.fits
 HDU = re.compile(r"\[[^]]*\]$")
-MAX_LIST_BYTES = 1_000_000
 
 
 def check(args: argparse.Namespace, **kinds: Callable[[Path], None]) -> None:
@@ -86,20 +84,6 @@ def stars(path: Path) -> None:
         catalogue.load_catalogue(str(path))
     except CatalogueError:
         raise _there(path, "not a catalogue made by starpos") from None
-
-
-def failed_fields(folder: Path) -> None:
-    """The check of a folder for the fields that `starpos montecarlo` failed on: its lists have a verdict."""
-    if not folder.is_dir():
-        raise _there(folder, "no folder")
-    for path in sorted(folder.glob("*.csv")):
-        head = files.read_regular(path, MAX_LIST_BYTES).partition(b"\n")[0]
-        try:
-            is_ours = "VERDICT" in json.loads(head.removeprefix(b"#"))
-        except (ValueError, TypeError, RecursionError):
-            is_ours = False
-        if not is_ours:
-            raise _there(path, "starpos montecarlo did not write it")
 
 
 def save_instrument(name: str, found: Instrument, about: str, *, camera_found: bool = False) -> None:

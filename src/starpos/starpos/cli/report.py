@@ -19,8 +19,6 @@ from starpos.parameters.given import of_solver
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
-# maximum number of nights with all figures; more nights get the table and the errors only
-ALL_FIGURES = 6
 # endings of a page in one file
 PAGES = (".html", ".htm")
 
@@ -50,9 +48,7 @@ def run(args: argparse.Namespace) -> int:
     nights = _nights(groups, args)
     bar, each = console.ProgressBar(), []
     for k, (night, paths) in enumerate(zip(nights, groups, strict=True)):
-        each.append(
-            list(pictures_of(night, catalogue.load_catalogue())) if len(nights) <= ALL_FIGURES else []
-        )
+        each.append(list(pictures_of(night, catalogue.load_catalogue())))
         if are_photographs(paths) and (named := named_photograph(night, {p.name: p for p in paths})):
             each[-1].insert(1, named)
         bar("figures", (k + 1) / len(nights))

@@ -55,7 +55,7 @@ class BlindSolver:
 
     def identify(self, stars: Stars) -> Solution:
         """Names of the stars, pointing, focal length and lens of a camera with its axis near the middle of the frame."""
-        begin, limit = time.perf_counter(), CpuLimit.of(self.search_s)
+        begin = time.perf_counter()
         inside = np.flatnonzero(stars.on_frame)
         seen = stars.select(inside)
         if len(seen) < MIN_STARS:
@@ -70,6 +70,9 @@ class BlindSolver:
             sky = Sky.at(self.catalogue, no_triangles(), stars.mid_unix_s)
         except StarposError as e:
             return Solution.refused(stars, e)
+        # building them takes no time of the search
+        self.prepare()
+        limit = CpuLimit.of(self.search_s)
         match = self._match(seen, sky, limit)
         if match is None:
             return replace(

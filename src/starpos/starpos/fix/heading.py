@@ -19,7 +19,7 @@ from starpos.fix.attitude import CAMERA, ENU, Attitude, heading_row
 from starpos.fix.budget import Circumstances, link_attitude, mount_term, sky_terms
 from starpos.fix.checks import check_visible
 from starpos.fix.sighting import FittedSighting, fitted_fields
-from starpos.fix.star_fit import MatchedStars, StarFit, adjustment_of, apparent, fit_stars
+from starpos.fix.star_fit import MatchedStars, StarAdjustment, StarFit, apparent, fit_stars
 from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
 from starpos.frozen import at_once
 from starpos.identification import fisheye
@@ -36,6 +36,9 @@ LENS_VALUES = 20
 # a zenith that refraction shows within this (rad), with two sigma, confirms the hour: with an hour that is wrong it is
 # some 5 deg off, because the lens takes up the rest of 15
 CONFIRMED_RAD = math.radians(3)
+# a camera whose optical axis is not where it is taken to be seems to lean so much, and, where its stars do not lie all
+# around, to have turned about its axis by this share
+ROLLED = 0.05
 # step of the numerical derivatives, rad
 STEP_RAD = 1e-3
 
@@ -100,8 +103,8 @@ def attitude_at_place(stars: MatchedStars, place: Place, about: Circumstances) -
     if fisheye.is_wide(camera) and atmosphere.pressure_pa:
         leaned = [rotation.from_vector(turn) for turn in np.eye(3)[:2] * STEP_RAD]
         leaning = [
-            adjustment_of(stars.xy, camera, r @ g, itrs, refraction).predict(
-                r @ seen.fit.a4, seen.fit.scale, refraction.compiled
+            StarAdjustment(xy=stars.xy, itrs=itrs, g=r @ g, camera=camera, refraction=refraction).predict(
+                r @ seen.fit.a4, seen.fit.scale
             )
             for r in leaned
         ]
@@ -111,11 +114,12 @@ def attitude_at_place(stars: MatchedStars, place: Place, about: Circumstances) -
         *seen.terms(np.eye(3), about),
         *sky_terms(np.eye(3), about.earth, about.clock_stddev_s, about.stamp_stddev_s, a4),
         ErrorTerm("place", moved @ place.zenith_root, shared=ALWAYS),
+        ErrorTerm("lens", g * np.array([1, 1, ROLLED]) * about.axis_stddev, shared=ALWAYS),
     )
     deflected = moved * place.plumb_stddev, moved * place.ellipsoid_stddev
     return AttitudeAtPlace(
         **fitted_fields(seen, about, g, a4),
-        **attitudes_at(place, g, about.mounting, terms, deflected, about.axis_stddev),
+        **attitudes_at(place, g, about.mounting, terms, deflected),
         place=place,
         hour_shown=shown,
     )
@@ -127,7 +131,6 @@ def attitudes_at(
     mounting: Mounting,
     terms: Iterable[ErrorTerm],
     deflected: tuple[np.ndarray, np.ndarray],
-    axis_stddev: float = 0.0,
 ) -> dict[str, Any]:
     """The base link by the plumb line, by the ellipsoid, and level by the first with north by the second.
 
@@ -148,7 +151,6 @@ def attitudes_at(
             (
                 *map(whole, terms),
                 whole(ErrorTerm("deflection", deflection, shared=ALWAYS)),
-                *mount_term("lens", link_to_enu, axis_stddev),
                 *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
             ),
         )

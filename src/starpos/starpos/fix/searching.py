@@ -26,7 +26,7 @@ from starpos.frozen import at_once
 from starpos.identification import Identification, blind, quads
 from starpos.identification.blind import STAGES
 from starpos.identification.prior import Hint
-from starpos.identification.search import MIN_LOG_ODDS_WITH_LOOK
+from starpos.identification.search import MIN_LOG_ODDS_WITH_LOOK, Priors
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import Tilts
 from starpos.progress import CpuLimit, Progress
@@ -57,7 +57,7 @@ class Question:
     stars: the detected ones, or the list.
     tilts: for a fix; None if only an identification, or a heading, is asked for.
     places: where the instrument is known to be, for its heading there; None if unknown.
-    hint: where to look first, of an earlier solution.
+    predicted, hint: where to look first, the latter of an earlier solution.
     until_s: by time.monotonic, when no further way is begun.
     known: an identification of `stars`, with which nothing is searched for a fix; None without one.
     """
@@ -66,6 +66,7 @@ class Question:
     stars: Stars
     tilts: Tilts | None = None
     places: Places | None = None
+    predicted: Priors = ()
     hint: Hint | None = None
     until_s: float = NEVER_S
     known: Identification | None = None
@@ -105,7 +106,7 @@ def answer_frame(solver: Solver, question: Question) -> Sight:
     q, disc = question, question.stars.disc
     if disc is None or (q.tilts is None and q.places is None):
         return _by_stars(solver, q)
-    found = solver.identify(q.stars)
+    found = solver.identify(q.stars, q.predicted)
     if not found.lost:
         return _by_stars(solver, replace(q, known=found.found))
     by_day = Sight(q.stars, by_sun(solver, q.stars, disc, q.tilts, q.places))
@@ -132,7 +133,7 @@ def _by_stars(solver: Solver, question: Question) -> Sight:
 
 def identify_every_way(solver: Solver, question: Question) -> Sight:
     """Identify a frame; its stars that identified it, or the given ones with the first answer if none did."""
-    first = Sight(question.stars, solver.identify(question.stars))
+    first = Sight(question.stars, solver.identify(question.stars, question.predicted))
     # most frames are: what all other ways need is not made for them
     return _otherwise(solver, question, first) if first.solution.lost else first
 
@@ -154,7 +155,7 @@ def identify_blind_every_way(solver: BlindSolver, item: Frame | Stars, stars: St
 
 def _solved(solver: Solver, q: Question, tilts: Tilts) -> Sight:
     """The fix of a frame, whose stars are searched with refraction removed first."""
-    answer = solver.solve(q.stars, tilts, q.hint, q.known)
+    answer = solver.solve(q.stars, tilts, q.hint, q.predicted, q.known)
     sight = _otherwise(solver, q, Sight(q.stars, answer))
     if sight.solution is answer:
         return sight
@@ -171,12 +172,12 @@ def _ways(solver: Solver, q: Question, seen: Stars) -> Iterator[Solution]:
     """Yield the answers to these stars of a frame, by one way after another; its own were searched already."""
     look = look_at(q.item, seen)
     if seen is not q.stars:
-        yield solver.identify(seen)
+        yield solver.identify(seen, q.predicted)
     if look is not None:
-        yield solver.look_again(seen, look)
-    yield solver.identify(seen, part=PART)
+        yield solver.look_again(seen, look, q.predicted)
+    yield solver.identify(seen, q.predicted, part=PART)
     if look is not None:
-        yield solver.look_again(seen, look, part=PART)
+        yield solver.look_again(seen, look, q.predicted, part=PART)
 
 
 def focal_px_that_fits(solver: Solver, stars: Stars) -> float | None:
@@ -306,6 +307,5 @@ def _fitting(solver: Solver, q: Question, progress: Progress) -> Instrument | No
     if focal_px is not None:
         return replace(solver.instrument, focal_px=focal_px)
     blind = BlindSolver(solver.catalogue, progress, search_s=HINT_SEARCH_S)
-    blind.prepare()
     seen = identify_blind_every_way(blind, q.item, q.stars).solution.pointing
     return None if seen is None else replace(solver.instrument, focal_px=seen.focal_px, model=seen.model)

@@ -46,6 +46,7 @@ from starpos.identification.pose import MIN_SIGMA_PX, TEST_STARS
 from starpos.identification.prior import AimPrior, Hint
 from starpos.identification.search import (
     Look,
+    Priors,
     identify_near,
     second_look,
     through,
@@ -53,7 +54,7 @@ from starpos.identification.search import (
 from starpos.identification.triangles import TriangleCatalogue, cached_triangles
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.inclinometer import EITHER_WAY, Tilt
-from starpos.instrument.instrument import OWN_LEVEL, UNKNOWN_CLOCK_S, ByGravity, Instrument
+from starpos.instrument.instrument import FISHEYE_AXIS, OWN_LEVEL, UNKNOWN_CLOCK_S, ByGravity, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
@@ -116,11 +117,6 @@ ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 130.0
 
 
-# A fisheye of which only the focal length is known misplaces stars by about this, outwards: it cancels where they lie all
-# around, and not where a mask leaves one side.
-NOMINAL_LENS_RAD = 0.002
-
-
 @dataclass(frozen=True)
 class Solver:
     """Solver for one instrument in its surroundings: `solve` makes a fix, `identify` a pointing alone, by one search.
@@ -158,15 +154,17 @@ class Solver:
         Sky(catalogue, triangles).load()
         return deeper.too_thin(catalogue, camera)
 
-    def identify(self, stars: Stars, part: float = 1.0) -> Solution:
-        """Names of the stars and pointing of the camera.
+    def identify(self, stars: Stars, predicted: Priors = (), part: float = 1.0) -> Solution:
+        """Names of the stars and pointing of the camera, near a prediction or anywhere.
 
         Stars without a time have J2000 places.
         part: of the frame in which its stars lie, as a share of its size: triangles that are looked up are no larger.
         """
-        return self._identified(stars, part, lambda field, sky, _: identify(field, sky, _aims(stars, field)))
+        return self._identified(
+            stars, part, lambda field, sky, _: identify(field, sky, (*predicted, *_aims(stars, field)))
+        )
 
-    def look_again(self, stars: Stars, look: Look, part: float = 1.0) -> Solution:
+    def look_again(self, stars: Stars, look: Look, predicted: Priors = (), part: float = 1.0) -> Solution:
         """Identify stars that alone are too few, by what their frame shows where others should be.
 
         Only for a frame on which `identify` has failed; a fisheye's stays unidentified.
@@ -176,7 +174,7 @@ class Solver:
             field: FrameStars | fisheye.WideField, sky: Sky, camera: Camera
         ) -> Identification | None:
             if isinstance(field, FrameStars):
-                return second_look(field, sky, _aims(stars, field), camera, look)
+                return second_look(field, sky, (*predicted, *_aims(stars, field)), camera, look)
             return None
 
         return self._identified(stars, part, by_looking)
@@ -207,18 +205,19 @@ class Solver:
         stars: Stars,
         tilts: Tilts = NO_TILTS,
         hint: Hint | None = None,
+        predicted: Priors = (),
         known: Identification | Hint | None = None,
     ) -> Solution:
         """The fix of one frame; a fault of the frame, the tilt or the time is a status and never an exception.
 
         tilts: not used for a camera that is its own level.
-        hint: where to look, of an earlier solution; a wrong one costs 0.5 ms and does no harm.
+        predicted, hint: where to look, the latter of an earlier solution; a wrong one costs 0.5 ms and does no harm.
         known: an identification of these stars, or a hint outside of which they are not to be searched.
         """
         if (rows := self._inside(stars)) is not None:
             if isinstance(known, Identification):
                 known = known.but(star=np.searchsorted(rows, known.star))
-            return self.solve(stars.select(rows), tilts, hint, known).among(stars, rows)
+            return self.solve(stars.select(rows), tilts, hint, predicted, known).among(stars, rows)
         try:
             state, tilt = self.levelled(stars, tilts)
             camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
@@ -228,7 +227,7 @@ class Solver:
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
             field = field_of(directions, mean_sigma(stars.covariance), camera, stars.window)
             if known is None:
-                priors = (*(hint.priors(state, g[2]) if hint else ()), *_aims(stars, field))
+                priors = (*predicted, *(hint.priors(state, g[2]) if hint else ()), *_aims(stars, field))
                 found = identify(field, sky, priors)
             elif isinstance(known, Hint):
                 found = identify_near(field, sky, known.priors(state, g[2]))
@@ -375,11 +374,7 @@ class Solver:
         about = self.circumstances(stars, camera.scaled(found.focal_scale), state)
         uncalibrated = fisheye.is_wide(camera) and not any(camera.distortion)
         if uncalibrated:
-            off = matched.xy - [camera.cx, camera.cy]
-            # how far they lie on one side of the axis, from 0 to 1
-            aside = float(np.hypot(*off.mean(0)) / max(np.hypot(*off.T).mean(), 1e-9))
-            lens = NOMINAL_LENS_RAD * aside
-            about = replace(about, axis_stddev=math.hypot(about.axis_stddev, lens))
+            about = replace(about, axis_stddev=max(about.axis_stddev, FISHEYE_AXIS))
         attitude = attitude_at_place(matched, place, about)
         shown = attitude.hour_shown or self._hour_at_horizon(stars, found, camera, state, up)
         if not shown and self.hour_by_lens is not None:

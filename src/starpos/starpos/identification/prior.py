@@ -77,6 +77,10 @@ class PointingPrior:
             turned = rotation.from_vector([-y, x, 0.0]) @ self.attitude
             yield replace(pose, attitude=turned), radius_px, prior
 
+    def reach_rad(self, width: int, height: int) -> float:
+        """How far the attitude may be off, rad about each axis, for frames of this size in px to be found by it."""
+        return min(REACH * width / self.focal_px, 2 * STILL_PX / float(np.hypot(width, height)))
+
     def _known(self, field: FrameStars, reach_px: float, log_share: float) -> Prior:
         """The Prior of poses that shift the frame by at most reach_px, and turn and stretch its corners by STILL_PX."""
         shift, turn = reach_px / self.focal_px, STILL_PX / np.hypot(*field.half)

@@ -505,7 +505,8 @@ STANDARD_SIZES = {(320, 240), (640, 480), (800, 600), (1024, 768), (1280, 720), 
 # 1 sigma of the axis from a frame's centre if the frame's part of the sensor is unknown: its longer side, and at least
 # this, as most sensors have up to 7000 px
 MIN_UNKNOWN_PX = 2000.0
-# a fisheye's stars show its axis: where it is further off, in focal lengths, they do not fit an ideal lens
+# 1 sigma, in focal lengths, along x and y, of a fisheye's axis from a frame's centre, as of three real cameras; with an
+# axis much further off its stars do not fit an ideal lens
 FISHEYE_AXIS = 0.04
 SIZE_IN_FILE = "camera: {focal_mm, pixel_um, width, height} in the instrument file"
 

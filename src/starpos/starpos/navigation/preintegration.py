@@ -6,6 +6,7 @@ need not go through the readings again for each place it tries; here they are fo
 """
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -140,6 +141,16 @@ def summed(
         speeds=speeds,
         rates=rate,
     )
+
+
+def turn_between(imu: ImuLog, begin_s: float, end_s: float) -> tuple[np.ndarray, float]:
+    """The body's axes (3, 3) at a time in those at an earlier one, by the gyro alone, and the seconds without readings.
+
+    Where a reading is missing the next one stands in, after the last one that.
+    """
+    pieces = Pieces.cut(imu, np.array([begin_s, end_s]))
+    angle = pieces.gyro[0] * pieces.length_s[0, :, None]
+    return reduce(np.matmul, Rotation.from_rotvec(angle).as_matrix()), float(pieces.missing_s[0])
 
 
 def _by_errors(axes: np.ndarray, reading: np.ndarray) -> np.ndarray:

@@ -2,36 +2,32 @@
 """The work on one frame, as small objects that can be sent to any process or machine, where `OnFile` calls them."""
 
 import math
-import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starpos.calibration.camera import hour_by_lens, lens_of_frame
-from starpos.earth.place import Place, Places
+from starpos.earth.place import Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, InstrumentError, StarposError
 from starpos.fix import searching
 from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.solution import Solution
-from starpos.fix.solver import Solver, check_explained, placed
+from starpos.fix.solver import Solver, placed
 from starpos.frames.frame import Frame, Stars
 from starpos.frames.reading import read_frame
 from starpos.identification.prior import Hint
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import ByGravity, Instrument, with_frame_size
 from starpos.instrument.tilt_log import Tilts
-from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
+from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
 from starpos.sky.bodies import ERFA, SolarSystem
-from starpos.zenith.adjustment import DeflectionSession
-from starpos.zenith.doubts import checked_session
-from starpos.zenith.sighting import ZenithSighting, sighting
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
@@ -271,29 +267,6 @@ def identify(
 
 
 @dataclass(frozen=True)
-class ZenithSighted:
-    """Makes the ZenithSighting of a frame at a mark; a frame's fault is a Solution that gives the reason."""
-
-    instruments: Instruments
-    atmosphere: Atmosphere
-    tilts: Tilts
-    mark: Place
-
-    def __call__(self, item: Frame | Stars) -> ZenithSighting | Solution:
-        """The sighting of a frame, identified by every way there is."""
-        sight = Solving(self.instruments)(item)
-        instrument = sight.instrument or self.instruments.of(item)
-        if sight.found is None or instrument is None:
-            return sight.solution
-        solver = Solver(instrument, catalogue.load_catalogue(), self.atmosphere)
-        try:
-            check_explained(sight.solution)
-            return sighting(solver, sight.stars, sight.found, self.mark, self.tilts)
-        except StarposError as error:
-            return Solution.refused(sight.stars, error)
-
-
-@dataclass(frozen=True)
 class TrailSighted:
     """Finds the trails of satellites on a frame; a frame's fault is a Solution that gives the reason."""
 
@@ -313,56 +286,3 @@ class TrailSighted:
             return replace(sight, stars=stars, instrument=known), found
         except StarposError as error:
             return Solution.refused(stars, error)
-
-
-def deflection(
-    frames: Sequence[str | Path],
-    tilt: str | Path,
-    site: tuple[float, float, float],
-    instrument: Instrument | str | Path,
-    *,
-    atmosphere: Atmosphere | None = None,
-) -> DeflectionSession:
-    """The deflection of the vertical at a mark, from a zenith camera's frames and a tiltmeter's readings.
-
-    Parameters
-    ----------
-    frames : paths of frames or of lists of stars
-    tilt : path of the tiltmeter's CSV
-    site : latitude, longitude (deg) and height (m) of the mark on WGS 84
-    instrument : an Instrument, or the path of its file (YAML)
-    atmosphere : of refraction; None: not measured
-
-    Returns
-    -------
-    DeflectionSession
-        with xi_arcsec, eta_arcsec and covariance_arcsec2 (2, 2)
-
-    Raises
-    ------
-    FixError
-        the sightings do not bear a deflection
-
-    Examples
-    --------
-    >>> lists = sorted(Path("zenith").glob("stars_*.csv"))
-    >>> session = starpos.deflection(lists, "zenith/tilt.csv", (61.2, 24.5, 900.0), "zenith/instrument.yaml")
-    >>> round(session.xi_arcsec), round(session.eta_arcsec)
-    (30, -12)
-    """
-    known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
-    air = Atmosphere.measured(None, None) if atmosphere is None else atmosphere
-    read, paths = Reader(), tuple(map(str, frames))
-    first = First(read)(paths)
-    if first is None:
-        raise FrameError(f"none of the {len(paths)} frames can be read: give frames or lists of stars")
-    framed, _ = with_frame_size(known, first)
-    log = TiltFile(os.path.abspath(tilt), framed.inclinometer.noise_rad)
-    mark = Place.on_ellipsoid(site[0], site[1], height_m=site[2])
-    work = OnFile(read, ZenithSighted(Instruments(framed), air, log, mark))
-    sightings = []
-    for path in paths:
-        with suppress(FrameError):
-            answer = work(path)
-            sightings += [answer] if isinstance(answer, ZenithSighting) else []
-    return checked_session(sightings, framed, air, mark)

@@ -6,7 +6,7 @@ import reprlib
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cache
-from importlib import resources
+from pathlib import Path
 from typing import Any
 
 from starpos.errors import StarposError
@@ -157,12 +157,19 @@ def parameters_of(node: str) -> tuple[Parameter, ...]:
 
     A row that is the name of another node stands for the row of the same name there.
     """
+    rows = rows_of(Path(__file__).with_name("data") / f"{node}.yaml")
+    return tuple(_parameter(name, row) for name, row in rows.items())
+
+
+@cache
+def rows_of(file: Path) -> dict[str, Any]:
+    """The rows of a YAML file of a package."""
     import yaml
 
     # PyYAML's parser in C takes a tenth of the time; a build without it is rare
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    text = resources.files(__package__).joinpath("data", f"{node}.yaml").read_bytes()
-    return tuple(_parameter(name, row) for name, row in yaml.load(text, loader).items())
+    rows: dict[str, Any] = yaml.load(file.read_bytes(), loader)
+    return rows
 
 
 def defaults_of(node: str) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from starpos.gnss.solving import Watched
 from starpos.gnss.watch import GnssStatus
 from starpos.night.night import Night, Truth
 from starpos.report import coast, measures, night_figures
-from starpos.report.html import document, figures, sexagesimal, table, wide_table
+from starpos.report.html import document, figures, sexagesimal, table
 from starpos.report.style import Picture, figures_of
 from starpos.sky.catalogue import Catalogue
 from starpos.units import utc_text
@@ -201,18 +201,12 @@ def page(
 ) -> str:
     """The HTML of nights.
 
-    each: pictures of each night, all empty if the nights are too many; overall: pictures of all nights together.
+    each: pictures of each night; overall: pictures of all nights together.
     """
     title = (
         f"starpos report: {nights[0].name}" if len(nights) == 1 else f"starpos report: {len(nights)} nights"
     )
-    parts = [f"<h1>{escape(title)}</h1>"]
-    if len(nights) > 1:
-        parts += [_table_of_nights(nights), figures(overall)]
-        if not any(each):
-            parts.append(
-                '<p class="soft">Too many nights for the figures of each: report on fewer to see them.</p>'
-            )
+    parts = [f"<h1>{escape(title)}</h1>", figures(overall)]
     for number, (night, pictures) in enumerate(zip(nights, each, strict=True), 1):
         if len(nights) > 1:
             parts.append(f'<h2 id="night{number}">{number}. {escape(night.name)}</h2>')
@@ -354,30 +348,3 @@ def _names(night: Night) -> str:
     listed = escape(", ".join(names[:LISTED])) + more
     summary = f"Input: {escape(night.name)}, {len(names)} frames"
     return f'<details class="soft"><summary>{summary}</summary><p>{listed}</p></details>'
-
-
-def _table_of_nights(nights: Sequence[Night]) -> str:
-    titles = (
-        "",
-        "Night",
-        "Latitude, longitude on WGS 84",
-        "1 sigma",
-        "Error N, E, astronomic",
-        "Latitude, longitude",
-        "Frames",
-    )
-    rows = []
-    for number, n in enumerate(nights, 1):
-        cells = ['<span class="bad">no position</span>', "", "", ""]
-        if n.combined:
-            ground = n.combined.on_ground(n.vertical)
-            cells[0] = f"{_degrees(ground.latitude)}, {_degrees(ground.longitude)}"
-            cells[1] = _errors(ground.covariance)
-        if n.combined and n.truth:
-            east, north = measures.offset_m(n.combined, n.truth.latitude, n.truth.longitude)
-            cells[2] = f"{north:+.0f} m, {east:+.0f} m"
-            cells[3] = ", ".join(f"{v:+.2f}&Prime;" for v in measures.error_arcsec(n.combined, n.truth))
-        name = f'<a href="#night{number}">{escape(n.name)}</a>'
-        row = [str(number), name, *cells, f"{len(n.fixed)} of {len(n.shots)}"]
-        rows.append(row)
-    return wide_table(titles, rows)

@@ -2,14 +2,14 @@
 """What of the satellites can be seen from a place in a night: in sunlight, high enough, and how many in a lens."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, enu_axes
 from starpos.earth.gravity import itrs_place
-from starpos.earth.orientation import EarthState, earth_state
+from starpos.earth.orientation import earth_state
 from starpos.frozen import at_once
 from starpos.rotation import normalised, unit_vector
 from starpos.satellites.elements import Orbit
@@ -62,61 +62,38 @@ def nights_hours(
     """
     latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
     enu, site = enu_axes(latitude, longitude), itrs_place(latitude, longitude, 0.0)
-    pointings = np.array([[0.0, 0.0, 1.0], *_leaning()])
+    leaning = [(lean, k) for lean in LEANS for k in range(AZIMUTHS)]
+    pointings = np.array(
+        [[0.0, 0.0, 1.0]]
+        + [unit_vector(math.pi / 2 - 2 * math.pi * k / AZIMUTHS, math.pi / 2 - lean) for lean, k in leaning]
+    )
     sky = OrbitsAbove(orbits) if orbits else None
+    least = math.sin(math.radians(least_deg))
     steps = math.ceil(begin_unix_s / STEP_S) + np.arange(round(24 * HOUR_S / STEP_S))
-    hours: dict[int, list[_Moment]] = {}
+    # by hour, for its dark moments: sine of the Sun's height, rows seen, their number by pointing
+    hours: dict[int, list[tuple[float, np.ndarray, np.ndarray]]] = {}
     for t in (steps * STEP_S).tolist():
-        state = earth_state(t)
-        sun = body_at(SUN, state).itrs
-        if sun @ enu[2] < DARK:
-            hours.setdefault(int(t // HOUR_S), []).append(
-                _Moment.of(state, sun, sky, site, enu, math.sin(math.radians(least_deg)), lens_deg, pointings)
-            )
+        sun = body_at(SUN, earth_state(t)).itrs
+        if (sine := float(sun @ enu[2])) >= DARK:
+            continue
+        rows, in_lens = np.zeros(0, int), np.zeros(len(pointings))
+        if sky is not None:
+            r, _ = sky.at(t)
+            v = normalised(r - site) @ enu.T
+            rows = np.flatnonzero((v[:, 2] > least) & sunlit(r, sun))
+            if lens_deg is not None:
+                in_lens = _in_lens(v[rows], pointings, lens_deg)
+        hours.setdefault(int(t // HOUR_S), []).append((sine, rows, in_lens))
     return [_hour(number, moments, orbits, pointings) for number, moments in hours.items()]
 
 
-def _leaning() -> Iterator[np.ndarray]:
-    """Directions (3,) in ENU that a camera may look to, except the zenith."""
-    for lean in LEANS:
-        for k in range(AZIMUTHS):
-            yield unit_vector(math.pi / 2 - 2 * math.pi * k / AZIMUTHS, math.pi / 2 - lean)
-
-
-@dataclass(frozen=True, eq=False)
-class _Moment:
-    """One time: sine of the Sun's height, rows of the orbits that are seen, and their number in the lens by pointing."""
-
-    sun: float
-    rows: np.ndarray
-    in_lens: np.ndarray
-
-    @classmethod
-    def of(
-        cls,
-        state: EarthState,
-        sun: np.ndarray,
-        sky: OrbitsAbove | None,
-        site: np.ndarray,
-        enu: np.ndarray,
-        least: float,
-        lens_deg: tuple[float, float] | None,
-        pointings: np.ndarray,
-    ) -> "_Moment":
-        height = float(sun @ enu[2])
-        if sky is None:
-            return cls(height, np.zeros(0, int), np.zeros(len(pointings)))
-        r, _ = sky.at(state.utc_unix_s)
-        v = normalised(r - site) @ enu.T
-        rows = np.flatnonzero((v[:, 2] > least) & sunlit(r, sun))
-        if lens_deg is None:
-            return cls(height, rows, np.zeros(len(pointings)))
-        # the lens's width is level
-        across = normalised(np.cross(pointings, [0.0, 1e-9, 1.0]))
-        seen = [v[rows] @ axes.T for axes in (across, np.cross(across, pointings), pointings)]
-        half = np.tan(np.radians(lens_deg) / 2)
-        inside = (seen[2] > 0) & (abs(seen[0]) < half[0] * seen[2]) & (abs(seen[1]) < half[1] * seen[2])
-        return cls(height, rows, inside.sum(0))
+def _in_lens(v: np.ndarray, pointings: np.ndarray, lens_deg: tuple[float, float]) -> np.ndarray:
+    """How many of the directions v (N, 3) in ENU a lens sees that looks along each of the pointings (P, 3)."""
+    # the lens's width is level
+    across = normalised(np.cross(pointings, [0.0, 1e-9, 1.0]))
+    x, y, z = (v @ axes.T for axes in (across, np.cross(across, pointings), pointings))
+    width, height = np.tan(np.radians(lens_deg) / 2)
+    return ((z > 0) & (abs(x) < width * z) & (abs(y) < height * z)).sum(0)
 
 
 def sunlit(r: np.ndarray, sun: np.ndarray) -> np.ndarray:
@@ -126,19 +103,22 @@ def sunlit(r: np.ndarray, sun: np.ndarray) -> np.ndarray:
 
 
 def _hour(
-    number: int, moments: Sequence[_Moment], orbits: Sequence[Orbit], pointings: np.ndarray
+    number: int,
+    moments: Sequence[tuple[float, np.ndarray, np.ndarray]],
+    orbits: Sequence[Orbit],
+    pointings: np.ndarray,
 ) -> HourOfSatellites:
-    in_lens = np.mean([m.in_lens for m in moments], axis=0)
-    best = int(in_lens.argmax())
+    suns, seen, in_lens = zip(*moments, strict=True)
+    mean = np.mean(in_lens, axis=0)
+    best = int(mean.argmax())
     east, north, up = pointings[best]
-    sines = np.array([moments[0].sun, moments[-1].sun])
-    rows = np.unique(np.concatenate([m.rows for m in moments]))
+    sines = np.array([suns[0], suns[-1]])
     return HourOfSatellites(
         utc_unix_s=number * HOUR_S,
         sun_deg=np.degrees(np.arcsin(sines)),
         lit_from_km=(SHADOW_M / math.sqrt(1 - sines.max() ** 2) - EARTH_RADIUS_M) / 1e3,
-        numbers=np.array([orbits[k].number for k in rows], int),
-        at_once=float(np.mean([len(m.rows) for m in moments])),
-        in_lens=float(in_lens[best]),
+        numbers=np.array([orbits[k].number for k in np.unique(np.concatenate(seen))], int),
+        at_once=float(np.mean([len(rows) for rows in seen])),
+        in_lens=float(mean[best]),
         towards=(math.degrees(math.atan2(east, north)) % 360, math.degrees(math.asin(min(up, 1.0)))),
     )

@@ -77,6 +77,10 @@ class CameraSolver:
         if self._frame_px is not None or not open_size:
             self._queue(camera, stamp_to_unix(message.header.stamp), at_once)
 
+    def use_known(self, camera: Camera) -> None:
+        """Use a camera that is known without a CameraInfo."""
+        self._queue(camera, None, at_once=True)
+
     def note_frame_size(self, width: int, height: int, at_once: bool) -> None:
         """Note the size of a frame, px: a CameraInfo that leaves its size open takes it."""
         if (width, height) != self._frame_px:

@@ -18,6 +18,7 @@ from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.gnss import states
+from starpos.gnss.filter import what_would_tell_more
 from starpos.gnss.receiver import NEAREST_S, GnssTrack, message_to_gnss
 from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
@@ -290,6 +291,7 @@ class GnssTeacher:
             "A3 across the plumb line (arcsec, 1 sigma)": across / ARCSEC,
             "A3 about the plumb line (arcsec, 1 sigma)": about / ARCSEC,
             "deflection (arcsec, 1 sigma)": learned.deflection_stddev_rad / ARCSEC,
+            "more would tell": what_would_tell_more(learned),
         }
 
 

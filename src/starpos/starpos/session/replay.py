@@ -1,15 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recorded night through a session, as the nodes solve it when `replay` plays the bag to them."""
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starpos.averaging.average import Average
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import StarposError
 from starpos.fix.solution import Solution
+from starpos.frames.frame import Stars
+from starpos.frames.reading import read_frame
+from starpos.frames.tables import TILTS
+from starpos.instrument import instrument_file
+from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.tilt_table import read_tilt_csv
+from starpos.messages.stamp import PlainHeader, PlainStamp
+from starpos.messages.tilt import Reading
+from starpos.night.field import INSTRUMENT, is_field, opened
+from starpos.night.opening import frames_in
+from starpos.night.reading import stars_of
 from starpos.recording import topics
 from starpos.recording.bag import BagReader
 from starpos.recording.drivers import IMAGES, DriverMessages, Drivers
@@ -64,6 +78,25 @@ class Replay:
         yield from self._ended(Now.in_data(now_ns * 1e-9))
         self.remarks += messages.remarks()
 
+    def play_lists(self, camera: Camera, stars: Sequence[Stars], tilts: TiltLog) -> Iterator[Output]:
+        """Yield what the solver publishes of lists of stars with times, and of tilts, each at its own time."""
+        self.session.instrument.use_known(camera)
+        messages: list[tuple[float, Any]] = [
+            (unix_s, _tilt_message(tilts, k)) for k, unix_s in enumerate(tilts.utc_unix_s.tolist())
+        ]
+        messages += [((s.mid_unix_s or 0.0) + (s.exposure_s or 0.0) / 2, s) for s in stars]
+        now = Now.in_data(0.0)
+        for unix_s, message in sorted(messages, key=lambda m: m[0]):
+            now = Now.in_data(unix_s)
+            if isinstance(message, Stars):
+                self.frames += 1
+                stamp = PlainStamp.of_ns(round((message.mid_unix_s or 0.0) * 1e9))
+                yield from self.session.receive_detected(message, PlainHeader(stamp, "camera"), now)
+            else:
+                yield from self._receive_tilt(message, now)
+            yield from self._settled(now)
+        yield from self._ended(now)
+
     def _taken(self, kind: str, message: Any, messages: DriverMessages, now: Now) -> list[Output]:
         """Have the session take a message, or the stars or tilt made from it."""
         session = self.session
@@ -109,6 +142,23 @@ class Replay:
             yield from self.session.at(now)
 
 
+def _tilt_message(log: TiltLog, k: int) -> Reading:
+    """The message of a reading."""
+    z, variance_z = (math.nan if c is None else float(c[k]) for c in (log.theta_z, log.variance_z))
+    return Reading(
+        stamp_ns=round(float(log.utc_unix_s[k]) * 1e9),
+        x=float(log.theta_x[k]),
+        y=float(log.theta_y[k]),
+        covariance=tuple(log.covariance[k].ravel().tolist()),
+        temperature_c=float(log.temperature_c[k]),
+        sequence=k,
+        flags=0,
+        z=z,
+        z_variance=variance_z,
+        frame_id="inclinometer",
+    )
+
+
 @dataclass(kw_only=True)
 class PlayedNight:
     """The result of a bag.
@@ -124,9 +174,9 @@ class PlayedNight:
 
     Examples
     --------
-    >>> played = starpos.replay("bag")
-    >>> len(played.solutions), played.trouble
-    (10, '')
+    >>> played = starpos.replay("night.zip")
+    >>> played.average.frames, played.trouble
+    (5, '')
     """
 
     instrument: Instrument
@@ -177,7 +227,15 @@ class Playing:
     remaps: topics.Remaps = field(default_factory=dict)
 
     def __call__(self, bag: str) -> PlayedNight:
-        settings = Settings.of(self.params_file, self.given, self.namespace)
+        if is_field(bag):
+            with opened(bag) as (folder, air):
+                told = self.given or self.params_file is not None
+                given = self.given if told else _parameters_in(folder, air)
+                return self._played(lambda replay: _play_field(replay, folder), given)
+        return self._played(lambda replay: replay.play(Path(bag), self.namespace), self.given)
+
+    def _played(self, play: Callable[[Replay], Iterator[Output]], given: Sequence[str]) -> PlayedNight:
+        settings = Settings.of(self.params_file, given, self.namespace)
         night = PlayedNight(instrument=settings.instrument(None))
         said = _Said(night)
         replay = Replay(
@@ -187,7 +245,7 @@ class Playing:
             Drivers.of(self.params_file, self.given, self.namespace, self.remaps),
         )
         try:
-            for output in replay.play(Path(bag), self.namespace):
+            for output in play(replay):
                 if isinstance(output, Answered):
                     # without what only its solver needs
                     night.solutions.append(replace(output.solution, hint=None))
@@ -202,6 +260,21 @@ class Playing:
         return night
 
 
+def _parameters_in(folder: Path, air: Atmosphere) -> list[str]:
+    """The solver's parameters, NAME:=VALUE, of an unpacked field report."""
+    measured = {"pressure": air.pressure_pa, "temperature": air.temperature_c, "humidity": air.humidity}
+    refraction = [f"refraction.{name}:={float(value)}" for name, value in measured.items()]
+    return [f"calibration_url:={folder / INSTRUMENT}", *refraction]
+
+
+def _play_field(replay: Replay, folder: Path) -> Iterator[Output]:
+    """What the session publishes of an unpacked field report."""
+    instrument = instrument_file.read(folder / INSTRUMENT)
+    stars = [stars_of(read_frame(path)) for path in frames_in(folder)]
+    tilts = read_tilt_csv(folder / TILTS, instrument.inclinometer.noise_rad)
+    return replay.play_lists(instrument.camera_for(stars[0].width, stars[0].height), stars, tilts)
+
+
 def replay(
     bag: str | Path,
     parameters: Sequence[str] = (),
@@ -212,7 +285,7 @@ def replay(
 
     Parameters
     ----------
-    bag : path of a rosbag2 with stars, tilts and camera_info, or with a robot's images and IMU
+    bag : path of a rosbag2 with stars, tilts and camera_info, or with a robot's images and IMU; or of a field report
     parameters : of the solver, as 'NAME:=VALUE'; with 'detector:' or 'inclinometer:' in front, of these
     params_file : YAML of parameters, as the nodes take it
     namespace : of the instrument, in a bag that holds several
@@ -230,8 +303,8 @@ def replay(
 
     Examples
     --------
-    >>> played = starpos.replay("bag", ["misalignment:=[0.31, -0.22, 0.53]", "misalignment_stddev:=5"])
+    >>> played = starpos.replay("night.zip")
     >>> played.summary
-    '10 frames, 10 answers, 10 fixes'
+    '5 frames, 5 answers, 5 fixes'
     """
     return Playing(None if params_file is None else Path(params_file), tuple(parameters), namespace)(str(bag))

@@ -24,14 +24,17 @@ from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.gnss.solving import Watched
 from starpos.identification.prior import Hint
+from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.session import reports
 from starpos.session.calibrating import Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
+from starpos.session.deflection import LiveDeflection
 from starpos.session.driver import Answered, Averaged, Changes, Heard, Jobs, Log, Now, Output, Sent, refusing
 from starpos.session.gnss import GnssTeacher, SessionPlaces
+from starpos.session.gyro import Gyro
 from starpos.session.pace import MAX_WAITING, Backlog, Pace, Waiting
 from starpos.session.settings import Settings
 from starpos.session.solving import AT_ONCE_S, Search, attitude_beside
@@ -79,6 +82,7 @@ class SolverSession:
         self.more = False
         self.tilts = TiltBuffer()
         self.doubt = ClockDoubt()
+        self.gyro = Gyro(heard)
         self.satellites: LiveSatellites | None = None
         if settings.orbits is not None:
             from starpos.session import satellites
@@ -88,6 +92,7 @@ class SolverSession:
         if settings.values["gnss.use"]:
             self.gnss = GnssTeacher(settings, jobs(), heard, log, self.satellites)
         self.places = SessionPlaces(settings, self.gnss, self.satellites)
+        self.deflection = LiveDeflection(settings, jobs())
         self._search = Search(settings.values)
         self._glows = Glows()
         self._settings, self._values = settings, settings.values
@@ -122,11 +127,13 @@ class SolverSession:
         self._hint = None
         self._search.other_camera()
         self._glows = Glows()
+        self.gyro.forget()
         if self.gnss is not None:
             self.gnss.other_camera()
         self.calibrating.camera_changed()
         if self.satellites is not None:
             self.satellites.forget()
+        self.deflection.forget()
 
     @property
     def waits(self) -> bool:
@@ -137,7 +144,7 @@ class SolverSession:
     def busy(self) -> bool:
         """Whether a job runs: what comes meanwhile may be answered with its outcome, or without."""
         located = self.satellites is not None and self.satellites.busy
-        return located or self.instrument.preparing or self.calibrating.busy
+        return located or self.instrument.preparing or self.calibrating.busy or self.deflection.busy
 
     # parameters ------------------------------------------------------------------------------------------------------
 
@@ -146,6 +153,7 @@ class SolverSession:
         if "clock_stddev" in names:
             self.doubt.clear()
         self.calibrating.parameters_set(names)
+        self.deflection.parameters_set(names)
         self.instrument.remake()
 
     # inputs ----------------------------------------------------------------------------------------------------------
@@ -328,8 +336,11 @@ class SolverSession:
         return stars.exposure_s or self._values["tilt_window"]
 
     def _solve(self, frame: Waiting, now: Now) -> list[Output]:
+        predicted: Priors = self._guarded(
+            lambda: self.gyro.predicted(frame.stars, self.instrument.solver), lambda e: ()
+        )
         until_s = self._search.until_s(now, bool(self._backlog))
-        question = self._question(frame, hint=self._hint, until_s=until_s)
+        question = self._question(frame, predicted=predicted, hint=self._hint, until_s=until_s)
         answer = self._answer(frame, question)
         if (fix := answer.fix) is not None and answer.ok:
             frame, answer = self._guarded(
@@ -416,7 +427,8 @@ class SolverSession:
             return None
         question = replace(question, item=frame.stars, stars=frame.stars)
         return self._guarded(
-            lambda: attitude_beside(solver, question, answer, frame.header.frame_id), lambda e: None
+            lambda: attitude_beside(solver, question, answer, frame.header.frame_id, self.gyro),
+            lambda e: None,
         )
 
     def _learn(self, frame: Waiting, answer: Solution) -> list[Output]:
@@ -434,6 +446,7 @@ class SolverSession:
             solver.instrument.inclinometer.check_live(tilt)
         except StarposError:
             return []
+        self._guarded(lambda: self.deflection.include(solver, stars, tilt, answer.found), lambda e: None)
         place = self._guarded(
             lambda: self.calibrating.include(Seen(stars, tilt, answer.found), answer.fix),
             # data that cause a defect must not stay
@@ -469,12 +482,14 @@ class SolverSession:
         self.tilts.clear()
         self._backlog.clear()
         self.latest = self.answer = self._hint = None
+        self.gyro.forget()
         if self.gnss is not None:
             self.gnss.places.forget()
         if self.satellites is not None:
             self.satellites.forget()
         self.doubt.clear()
         self.calibrating.forget()
+        self.deflection.forget()
 
 
 def _failed(frame: Waiting, what: str, error: Exception) -> Solution:

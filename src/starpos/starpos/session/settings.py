@@ -123,6 +123,18 @@ def site_of(values: Mapping, vertical: Vertical) -> Place | None:
     return make(latitude, longitude, vertical, np.eye(2) * values["site.stddev"] ** 2)
 
 
+def check_deflection(values: Mapping) -> None:
+    """Raise PlaceError if deflection.wanted lacks the mark."""
+    if math.isnan(values["deflection.wanted"]):
+        return
+    mark = (values["site.latitude"], values["site.longitude"], values["altitude"])
+    if not values["site.geodetic"] or any(math.isnan(value) for value in mark):
+        raise PlaceError(
+            "deflection.wanted is measured at a mark on WGS 84: set site.latitude, site.longitude, site.geodetic true "
+            "and altitude too"
+        )
+
+
 def vertical_of(values: Mapping, known: geoid.Geoid | None) -> Vertical:
     """Return the Geoid (`known`, or None), or the deflection that the parameters give for the place.
 
@@ -236,6 +248,7 @@ class Settings(NodeSettings):
 
     def _refuse(self, values: Mapping[str, Any], files: Mapping[str, Any]) -> None:
         check_gnss(values, instrument_of(values, ANY_CAMERA, files["calibration_url"]))
+        check_deflection(values)
 
     @property
     def learned(self) -> states.Learned | None:

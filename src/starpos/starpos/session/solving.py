@@ -16,6 +16,7 @@ from starpos.fix.sun import sun_alone
 from starpos.frames.frame import Stars
 from starpos.navigation.sightings import sighting_of
 from starpos.session.driver import Now
+from starpos.session.gyro import Gyro
 from starpos.sky.bodies import SUN
 
 # Share of the time between frames in which one may be searched.
@@ -94,9 +95,9 @@ def camera_attitude_of(
 
 
 def attitude_beside(
-    solver: Solver, question: searching.Question, answer: Solution, frame_id: str
+    solver: Solver, question: searching.Question, answer: Solution, frame_id: str, gyro: Gyro
 ) -> CameraAttitude | None:
-    """The attitude of a frame that was asked about; None without identified stars or the Sun.
+    """The attitude of a frame that was asked about, also given to the gyro; None without identified stars or the Sun.
 
     Where the solver stopped before identification, the stars are identified now.  The Sun's limb counts without a heading
     too: under way the level does not show where up is.  A glow, which may be a lamp's, counts with one alone.
@@ -106,4 +107,7 @@ def attitude_beside(
         return sun_alone(solver, question.stars, disc, frame_id) if answer.bodies in ((), (SUN,)) else None
     if answer.found is None and answer.status in searching.UNASKED:
         answer = searching.identify_every_way(solver, replace(question, tilts=None, places=None)).solution
-    return camera_attitude_of(solver, question.stars, answer, frame_id)
+    attitude = camera_attitude_of(solver, question.stars, answer, frame_id)
+    if attitude is not None and answer.found is not None:
+        gyro.learn_from(question.stars, answer.found, solver)
+    return attitude

@@ -188,14 +188,13 @@ def points(conditions: Conditions, seed: int) -> Iterator[Field]:
 class Tally:
     """Counts of right, wrong (or invented) and missing answers to fields.
 
-    cpu_ms: CPU time of each answer.  failed: fields without a right answer, with 'wrong' or 'none'.
+    cpu_ms: CPU time of each answer.
     """
 
     correct: int = 0
     wrong: int = 0
     none: int = 0
     cpu_ms: list[float] = field(default_factory=list)
-    failed: list[tuple[Field, str]] = field(default_factory=list)
 
     @property
     def fields(self) -> int:
@@ -209,13 +208,10 @@ class Tally:
         self.cpu_ms.append(1000 * (time.process_time() - begin))
         if found is None:
             self.none += 1
-            if given.centre is not None:
-                self.failed.append((given, "none"))
         elif given.centre is not None and np.linalg.norm(found - given.centre) < tolerance_rad:
             self.correct += 1
         else:
             self.wrong += 1
-            self.failed.append((given, "wrong"))
 
 
 def wilson(successes: int, n: int) -> tuple[float, float]:

@@ -70,7 +70,7 @@ def test_the_coefficients_are_found_within_what_is_claimed(lens, catalogue, rng)
 @pytest.mark.montecarlo
 def test_over_many_fisheyes_the_errors_are_those_claimed(rng):
     z, given = [], Camera.from_focal(1300, 1300, 600.0, EQUIDISTANT)
-    for _ in range(30):
+    for _ in range(15):
         lens = (rng.uniform(-0.03, 0.08), *rng.normal(0, [2e-3, 1e-4, 1e-5]).tolist())
         cx, cy = (np.array(given.centre_px) + rng.normal(0, 15, 2)).tolist()
         true = replace(random_fisheye(lens, rng), width=1300, height=1300, cx=cx, cy=cy)
@@ -133,7 +133,7 @@ def test_a_frame_of_the_middle_of_the_sky_does_not_show_its_hour(catalogue, rng)
     assert math.sqrt(wide.plumb.angles_covariance[0, 0]) > math.radians(5)
     stated = replace(from_files, instrument=replace(solver.instrument, clock_stddev_s=1.0))
     known = answer_frame(stated, Question(item=middle, stars=middle, places=SITE)).solution.at_place
-    assert math.sqrt(known.plumb.angles_covariance[0, 0]) < math.radians(0.1)
+    assert math.sqrt(known.plumb.angles_covariance[0, 0]) < math.radians(0.2)
 
 
 def test_a_frame_of_an_unknown_lens_shows_its_hour_or_claims_to_miss_it(catalogue, rng):

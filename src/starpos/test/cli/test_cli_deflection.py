@@ -1,12 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos deflection`, on lists of the stars above a place whose plumb line differs from the ellipsoid's normal."""
 
+import re
+
 import numpy as np
 import pytest
 from cli_calls import objects
 
+from starpos.errors import InstrumentError
 from starpos.frames.reading import read_frame
 from starpos.instrument.tilt_table import read_tilt_csv
+from starpos.session.driver import Level
+from starpos.session.replay import Replay
+from starpos.session.settings import Settings
 from starpos_testing.skies.folders import (
     ETA,
     HEIGHT_M,
@@ -82,6 +88,53 @@ def test_a_bag_gives_what_its_files_give(run, session, recorded):
         assert bag[key] == pytest.approx(files[key], abs=2e-3)
     status, _, err = run("deflection", recorded, *options, "--tilt", session / "tilt.csv")
     assert status == 2 and "has its own tilts" in err[-1]
+
+
+def played(recorded, session, wanted):
+    """Play the frames to the solver's session, which has the node's service and light say what it says."""
+    values = {
+        "deflection.wanted": wanted,
+        "site.latitude": LATITUDE,
+        "site.longitude": LONGITUDE,
+        "site.geodetic": "true",
+        "altitude": HEIGHT_M,
+        "calibration_url": session / "instrument.yaml",
+        "refraction.pressure": 90000.0,
+        "refraction.temperature": 5.0,
+        "refraction.humidity": 0.3,
+    }
+    replay = Replay(Settings.of(None, [f"{k}:={v}" for k, v in values.items()]), Silent(), Silent())
+    assert len(list(replay.play(recorded))) >= 8
+    return replay.session.deflection
+
+
+class Silent:
+    """Hears and logs nothing."""
+
+    def __getattr__(self, name):
+        return lambda *said: None
+
+
+def test_live_the_session_says_when_enough_is_enough(run, session, recorded):
+    live = played(recorded, session, 1.0)
+    told = live.report()
+    whole = objects(run("deflection", recorded, *arguments(session)[11:], "--json")[1])[-1]
+    assert told.level == Level.OK and told.message.startswith("enough; xi ")
+    assert told.values["xi arcsec"] == pytest.approx(whole["xi_arcsec"], abs=2e-3)
+    assert told.values["sigma eta arcsec"] == pytest.approx(whole["sigma_eta_arcsec"], rel=0.02)
+    assert told.values["frames"] == 8 and told.values["enough"]
+    live.forget()
+    assert live.report().message.startswith("0 frames so far")
+
+
+def test_live_a_session_that_lacks_something_says_what(session, recorded):
+    told = played(recorded, session, 0.005).report()
+    assert told.level == Level.WARN and not told.values["enough"]
+    assert re.match(
+        r"not enough: (about \d+ min more|more frames do not help, [a-z0-9 ]+ alone leaves)", told.message
+    )
+    with pytest.raises(InstrumentError, match=r"set site\.latitude"):
+        Settings.of(None, ["deflection.wanted:=0.1"])
 
 
 def test_its_lines_for_people_and_its_table(run, session):

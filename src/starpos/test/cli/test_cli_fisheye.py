@@ -138,12 +138,13 @@ def test_a_platepar_of_rms_is_written_and_serves_as_lens_and_place(skies, run, t
         assert status == 2 and why in err[-1] and not (tmp_path / "b.cal").exists()
 
 
-def test_a_mask_that_leaves_one_side_makes_the_heading_of_a_nominal_lens_less_certain(skies, run, tmp_path):
+def test_a_nominal_lens_claims_what_a_mask_and_an_axis_off_the_middle_do(skies, run, tmp_path):
     first = sorted(skies.glob("stars_*.csv"))[0]
     head, names, *rows = first.read_text().splitlines()
     half = tmp_path / first.name
     half.write_text("\n".join([head, names, *(row for row in rows if float(row.split(",")[0]) > 700)]) + "\n")
     site = ("--site", PLACE["latitude"], PLACE["longitude"])
     whole, part = (objects(run("solve", path, *LENS, *site, *AIR, "--json")[1])[0] for path in (first, half))
-    assert part["sigma_heading_deg"] > 3 * whole["sigma_heading_deg"]
-    assert abs(part["heading"] - whole["heading"]) < 3 * part["sigma_heading_deg"] < 0.5
+    assert 0 < abs(part["heading"] - whole["heading"]) < 3 * part["sigma_heading_deg"] < 0.5
+    # the optical axis may be some degrees off the middle of the frame, and then the camera seems to lean
+    assert whole["sigma_pitch_deg"] > 2

@@ -18,12 +18,11 @@ def calls(folder, out):
         "--camera": ("calibrate", *frames, *tilts, *WIDE, *AIR, "--camera", out),
         "--map": ("calibrate", *frames, *tilts, *WIDE, *AIR, "--camera", f"{out}.new", "--map", out),
         "--save": ("solve", *frames, *tilts, *WIDE, *AIR, "--self-calibrate", "--save", out),
-        "--keep": ("montecarlo", "--fields", "1", "--keep", out),
         "--out": ("catalogue", "build", "--gaia", folder / "tilt.csv", "--out", out),
     }
 
 
-OPTIONS = ("-o", "--camera", "--map", "--save", "--keep", "--out")
+OPTIONS = ("-o", "--camera", "--map", "--save", "--out")
 
 
 @pytest.mark.parametrize("option", OPTIONS)
@@ -110,16 +109,3 @@ def test_an_instrument_file_of_another_camera_or_sensor_stays(lists, run, tmp_pa
     status, _, errors = run(*fixed, "--fixed")
     assert status == 2 and "with an inclinometer" in errors[-1]
     assert out.read_bytes() == before
-
-
-def test_fields_that_failed_are_kept_beside_others_of_their_kind_only(run, tmp_path):
-    keep = tmp_path / "failed"
-    keep.mkdir()
-    (keep / "one.csv").write_text(
-        '# {"NAXIS1": 9, "NAXIS2": 9, "VERDICT": "none", "CENTRE": null}\nx,y,flux\n'
-    )
-    call = ("montecarlo", "--fields", "1", "--false", "0", "--stars", "--points", "0", "--keep", keep)
-    assert run(*call)[0] == 0
-    (keep / "two.csv").write_text('# {"NAXIS1": 9, "NAXIS2": 9}\nx,y,flux\n')
-    status, _, errors = run(*call)
-    assert status == 2 and "two.csv: it is there already" in errors[-1]

@@ -11,8 +11,8 @@ import pytest
 from cli_calls import WIDE
 
 from starpos import cli
-from starpos.cli import console, inputs, parser_for
-from starpos.cli.commands import commands
+from starpos.cli import COMMANDS, console, inputs, parser_for
+from starpos.cli.commands import command_of
 from starpos.fix import blind
 from starpos.frames import exif
 from starpos.frames.exposure import MAX_READOUT_S, UNKNOWN_SHUTTER
@@ -37,8 +37,8 @@ def test_catalogue_info(capsys):
 def test_help_and_version(capsys):
     status, out, errors = run(capsys, "--help")
     assert (status, errors) == (0, [])
-    assert all(name in out for name in commands())
-    for name in commands():
+    assert all(name in out for name in COMMANDS)
+    for name in COMMANDS:
         status, out, _ = run(capsys, name, "--help")
         assert status == 0
         assert f"starpos {name}" in out
@@ -171,7 +171,7 @@ def test_progress_of_frames_whose_lines_wait_is_shown_on_a_terminal_alone(capsys
     assert ("frame 2 of 2" in capsys.readouterr().err) is terminal
 
 
-EXAMPLES = [(name, example) for name, command in commands().items() for example in command.examples]
+EXAMPLES = [(name, example) for name in COMMANDS for example in command_of(name).examples]
 
 
 @pytest.mark.parametrize(("name", "example"), EXAMPLES)
@@ -180,10 +180,10 @@ def test_every_example_in_help_is_a_call_that_is_understood(name, example, capsy
         program, *words = shlex.split(call)
         # of --help the parser itself makes the end
         if program and "--help" not in words:
-            assert program == "starpos" and words[0] in commands()
+            assert program == "starpos" and words[0] in COMMANDS
             assert parser_for(words).parse_args(words).run
     _, out, _ = run(capsys, name, "--help")
-    assert f"  {example}\n" in out and commands()[name].next_step in out
+    assert f"  {example}\n" in out and command_of(name).next_step in out
 
 
 def option(command, name):

@@ -53,15 +53,15 @@ class Answering:
     def __init__(self, *answers):
         self.answers, self.ways = iter(answers), []
 
-    def identify(self, stars, part=1.0):
+    def identify(self, stars, predicted=(), part=1.0):
         self.ways.append(("search", stars.source, part))
         return next(self.answers)
 
-    def look_again(self, stars, look, part=1.0):
+    def look_again(self, stars, look, predicted=(), part=1.0):
         self.ways.append(("look", stars.source, part))
         return next(self.answers)
 
-    def solve(self, stars, tilts, hint=None, known=None):
+    def solve(self, stars, tilts, hint=None, predicted=(), known=None):
         self.ways.append(("solve", stars.source, known))
         return next(self.answers)
 

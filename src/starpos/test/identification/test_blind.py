@@ -10,6 +10,7 @@ import pytest
 
 from starpos import rotation
 from starpos.detection import detect
+from starpos.fix import blind as fix_blind
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
@@ -155,6 +156,14 @@ def test_a_search_ends_with_its_time_and_says_how_to_go_on(catalogue, rng):
     assert s.status is Status.NOT_IDENTIFIED and "in 1 s of CPU" in s.message and "--search-time" in s.message
     assert time.process_time() - begin < 4
     assert said and all(0 <= done <= 1 for done in said)
+
+
+def test_building_the_quads_takes_no_time_of_the_search(solver, catalogue, rng, monkeypatch):
+    order, quads_of, limit_of = [], fix_blind.cached_quads, fix_blind.CpuLimit.of
+    monkeypatch.setattr(fix_blind, "cached_quads", lambda *given: order.append("quads") or quads_of(*given))
+    monkeypatch.setattr(fix_blind.CpuLimit, "of", lambda *given: order.append("limit") or limit_of(*given))
+    xy, _, _ = seen(catalogue, 8.0, 8.5, rng)
+    assert solver.identify(listed(xy)).ok and order[:2] == ["quads", "limit"]
 
 
 def test_at_any_scale_the_quads_of_a_frame_are_those_of_the_sky(catalogue, rng):

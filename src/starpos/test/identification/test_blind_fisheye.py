@@ -27,9 +27,7 @@ SKIES = {
 
 @pytest.fixture(scope="module")
 def solver(catalogue):
-    solver = BlindSolver(catalogue)
-    solver.prepare()
-    return solver
+    return BlindSolver(catalogue)
 
 
 def axis_of(s):

@@ -186,3 +186,14 @@ def test_a_file_that_unpacks_to_too_much_or_is_no_zip_is_refused(report, tmp_pat
             limits.setattr(field, limit, most)
             assert main(["solve", str(report)]) == 2
     assert capsys.readouterr().err.count("not a field report") == 3
+
+
+def test_the_solvers_own_code_finds_the_same_place(report, capsys):
+    capsys.readouterr()
+    by_solve = solved(capsys, report)
+    assert main(["replay", str(report), "--json"]) == 0
+    *_, by_session = map(json.loads, capsys.readouterr().out.splitlines())
+    assert by_session["combined"]
+    for key in ("latitude", "longitude"):
+        # both are within the tilts that each takes to a frame
+        assert abs(by_session[key] - by_solve[key]) * 111_000 < by_solve["sigma_north_m"] / 2

@@ -204,7 +204,7 @@ def test_several_nights_are_held_against_their_truths(still, tmp_path, capsys):
     }
     for night in (still, other):
         want = solved(capsys, night, *KNOWN, *AIR)
-        assert page.text.count(f"{want['latitude']:+.6f}°, {want['longitude']:+.6f}°") >= 2
+        assert f"{want['latitude']:+.6f}°, {want['longitude']:+.6f}°" in page.text
 
 
 @pytest.mark.usefixtures("unpainted")

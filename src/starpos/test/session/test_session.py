@@ -373,8 +373,11 @@ def test_without_gnss_use_messages_of_gnss_change_no_answer(messages, begin_s):
 @pytest.mark.parametrize(
     "part, named",
     [
+        ("gyro.predicted", ""),
         ("_search.solve", "the solver failed on this frame (RuntimeError: a defect)"),
         ("doubt.judge", "the solver failed on this frame"),
+        ("gyro.learn_from", ""),
+        ("deflection.include", ""),
         ("calibrating.include", ""),
         ("gnss.solve", "what GNSS taught could not be used on this frame"),
     ],

@@ -9,7 +9,6 @@ import pytest
 
 from starpos.cli import main
 from starpos.errors import CatalogueError
-from starpos.frames.reading import read_frame
 from starpos.instrument.camera import Camera
 from starpos.simulation import montecarlo_fields as mc
 from starpos_testing.skies.scenes import FOCAL_PX, SIZE
@@ -105,7 +104,6 @@ def test_answers_are_counted(catalogue, conditions):
     for field, answer in answers:
         tally.ask(field, field.stars(conditions), lambda stars, answer=answer: answer, tolerance)
     assert (tally.correct, tally.wrong, tally.none, tally.fields) == (1, 2, 2, 5)
-    assert [verdict for _, verdict in tally.failed] == ["wrong", "none", "wrong"]
     assert len(tally.cpu_ms) == 5
 
 
@@ -119,8 +117,8 @@ def test_wilson():
     assert mc.wilson(0, 0) == (0, 1)
 
 
-def test_the_command(capsys, tmp_path):
-    status = main(["montecarlo", *WIDE, *FEW, "--keep", str(tmp_path / "kept")])
+def test_the_command(capsys):
+    status = main(["montecarlo", *WIDE, *FEW])
     out = capsys.readouterr().out.splitlines()
     assert status == 0
     assert [line[:15].strip() for line in out[2:]] == [
@@ -130,8 +128,6 @@ def test_the_command(capsys, tmp_path):
         "random points",
     ]
     assert [int(line[15:23]) for line in out[2:]] == [4, 4, 4, 3]
-    for path in (tmp_path / "kept").iterdir():
-        assert len(read_frame(path)) >= 4
 
 
 def test_the_command_json(capsys):

@@ -7,6 +7,7 @@ import { Link } from "/link.js";
 import { showBudget, showLights } from "/lists.js";
 import { EarthMap } from "/map.js";
 import { dress, element, say } from "/page.js";
+import { offerPlace } from "/place.js";
 import * as text from "/text.js";
 
 const TICK_MS = 500;
@@ -61,6 +62,9 @@ function render() {
   const lights = state.lights.map((light) => ({ ...light, age: heardAgo(light) }));
   showLights(element("lights"), lights, state.old_after.fast);
   showLights(element("clocks"), lights.filter((l) => l.name.endsWith(": Clock")), state.old_after.fast);
+  const deflections = lights.filter((l) => l.name.endsWith(": Deflection"));
+  element("deflection-card").hidden = !deflections.length;
+  showLights(element("deflection"), deflections, state.old_after.fast);
   say("lights-note", lights.length ? "" : "no diagnostics yet");
   dressFrame();
 }
@@ -115,6 +119,7 @@ function showPosition(fix, old) {
   say("sigma-north", good ? `± ${text.metres(s.north)}` : text.UNKNOWN);
   say("altitude", text.metres(good?.altitude));
   say("decimal", good ? plain(good, s) : last ? `last fix ${plain(last, sigmas(last))}, ${text.age(stampAge(last))} ago` : "");
+  offerPlace(good);
   const average = state.averaged?.good && !isOld(state.averaged) && !old && good ? state.averaged : null;
   const a = sigmas(average);
   const both = ["latitude", "longitude"].map((n, i) => text.sexagesimal(average?.[n], ["NS", "EW"][i], a[n]));

@@ -90,13 +90,13 @@ class Traffic:
     bytes_per_second: float
 
 
-def traffic(folder: Path, frames: int, cadence_s: float, quiet_s: float = 10.0) -> Traffic:
-    """Measure the traffic of a number of full frames; the first, during which nodes find each other, do not count.
+def traffic(folder: Path, frames: int, cadence_s: float, quiet_s: float = 10.0, size=FULL) -> Traffic:
+    """Measure the traffic of a number of frames; the first, during which nodes find each other, do not count.
 
     quiet_s: time without a camera, to measure the tilts' traffic.
     """
     with two_hosts() as instrument:
-        camera = start(instrument, folder, FULL, cadence_s)
+        camera = start(instrument, folder, size, cadence_s)
         ear, cable = instrument.ear, instrument.cable
 
         def after(count: int) -> tuple[int, float]:
