@@ -6,7 +6,7 @@ import itertools
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -121,7 +121,8 @@ def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
         values = dict(zip(COLUMNS, (args.frame, utc_text(found.utc_unix_s), *row), strict=True))
         output.put(
             values,
-            f"{x:.2f} {y:.2f}: {azimuth:.4f} {altitude:.4f} ({without:.4f}) +- {across:.0f} {up:.0f} arcsec",
+            f"{x:.2f} {y:.2f}: {azimuth:.4f} {altitude:.4f} ({without:.4f}) "
+            + ("+- unknown" if np.isnan(across) else f"+- {across:.0f} {up:.0f} arcsec"),
         )
 
 
@@ -131,6 +132,8 @@ ALTITUDES, AZIMUTHS, ALONG = (0, 15, 30, 45, 60, 75), range(0, 360, 30), 0.5
 # altitude's stands from the line of the azimuth, deg
 LABEL_PX, LOWEST, OFF_THE_LINES = 20, 5, 3
 NAMES = {0: "N", 90: "E", 180: "S", 270: "W"}
+# frames are enlarged up to this length of the longer side
+SMALLEST_PX = 1000
 # bytes of a PNG up to the end of its first chunk
 PNG_HEADER = 33
 # blue, green, red
@@ -164,6 +167,23 @@ def _shade(picture: np.ndarray, seen: _Seen, n: int, ground: np.ndarray) -> None
     picture[below] = picture[below] // 3
 
 
+def _enlarged(
+    frame: Frame, stars: Stars, seen: _Seen, points: np.ndarray, n: int
+) -> tuple[Frame, Stars, _Seen, np.ndarray]:
+    """Enlarge a frame and what lies on it n times, so that there is room for names and numbers."""
+    width, height, c = n * frame.width, n * frame.height, seen.camera
+    camera = replace(
+        c.scaled(n), width=width, height=height, cx=(c.cx + 0.5) * n - 0.5, cy=(c.cy + 0.5) * n - 0.5
+    )
+    x, y = ((v + 0.5) * n - 0.5 for v in (stars.x, stars.y))
+    return (
+        replace(frame, pixels=frame.pixels.repeat(n, 0).repeat(n, 1)),
+        replace(stars, width=width, height=height, x=x, y=y),
+        replace(seen, camera=camera),
+        (points + 0.5) * n - 0.5,
+    )
+
+
 def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None) -> None:
     """Draw the frame with stars, the grid, constellations and the points, the ground (N, 2) in deg darkened."""
     import cv2
@@ -175,6 +195,8 @@ def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None)
         raise InstrumentError(
             f"{path}: a list of stars has no picture to draw on: give a frame for --overlay"
         )
+    if not frame.pattern and (larger := SMALLEST_PX // max(frame.width, frame.height)) > 1:
+        frame, stars, seen, points = _enlarged(frame, stars, seen, points, larger)
     star, magnitudes = (np.zeros(0) if v is None else v for v in (solution.star, solution.magnitudes))
     named = Identified(star=star.astype(int).tolist(), names=solution.names, magnitudes=magnitudes.tolist())
     picture = annotate(frame, stars, named)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,9 +20,6 @@ from starpos.fix.solution import Solution, status_of
 from starpos.fix.solver import Solver
 from starpos.frames.reading import are_photographs
 from starpos.frames.tables import Pointing, read_pointings
-from starpos.gnss import states
-from starpos.gnss.receiver import read_gnss_csv
-from starpos.gnss.solving import Watched
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import ByGravity, Instrument
 from starpos.instrument.phone_log import is_phone_log
@@ -34,7 +32,6 @@ from starpos.night.solving import How, NightAnswers, answers_of
 from starpos.night.together import (
     FrameAnswer,
     Gathered,
-    Receiver,
     TurnedNight,
     from_elevations,
     together,
@@ -43,6 +40,10 @@ from starpos.night.together import (
 from starpos.night.work import OnFile, Solving
 from starpos.sky import catalogue
 from starpos.units import utc_text
+
+if TYPE_CHECKING:
+    from starpos.gnss.states import Learned
+    from starpos.night.beside_gnss import Receiver
 
 
 def tell(
@@ -106,8 +107,7 @@ def _json_of_answer(
     """The answer to a frame for --json; with --gnss, its heading is at GNSS's place, and it has the key `gnss`."""
     s = answer.solution
     if args.gnss is not None:
-        watched = answer.watched or Watched(solution=s)
-        return {"file": answer.name} | json_of_watched(watched) | fix_output.json_about(s)
+        return {"file": answer.name} | json_of_watched(answer) | fix_output.json_about(s)
     values = {"file": answer.name} | fix_output.json_of(s.fix, vertical) | fix_output.json_about(s)
     if s.circle is not None:
         values |= {"utc": utc_text(s.circle.utc_unix_s)}
@@ -154,28 +154,36 @@ def say(folder: str | None, *texts: object) -> None:
         console.complain(text if folder is None else f"{folder}: {text}")
 
 
-def read_receiver(gnss: str | None, learned: str | None) -> Receiver | None:
+def read_receiver(gnss: str | None, learned: str | None) -> "Receiver | None":
     """Read the tables of --gnss and --learned; None without the first.  Raises StarposError."""
     if gnss is None:
         return None
+    from starpos.gnss import states
+    from starpos.gnss.receiver import read_gnss_csv
+    from starpos.night.beside_gnss import Receiver
+
     track, faults = read_gnss_csv(gnss)
     console.complain(*faults)
     before = None if learned is None else states.read_learned(Path(learned))
     return Receiver(track, before)
 
 
-def _save_learned(path: Path, learned: states.Learned | None) -> None:
+def _save_learned(path: Path, learned: "Learned | None") -> None:
+    from starpos.gnss import states
+
     if learned is None or not learned.frames:
         console.complain(f"{path} is not written: no frame with a GNSS place has taught anything")
     else:
         states.save_learned(path, learned)
 
 
-def json_of_watched(told: Watched) -> dict:
+def json_of_watched(answer: FrameAnswer) -> dict:
     """The keys of --json of a frame that come from its fix, or its heading at GNSS's place, and `gnss`."""
-    keys, check = fix_output.json_on_ground(told.solution.fix, told.ground), told.compared
-    if (at_place := told.solution.at_place) is not None:
+    told, solution = answer.watched, answer.solution
+    keys = fix_output.json_on_ground(solution.fix, None if told is None else told.ground)
+    if (at_place := solution.at_place) is not None:
         keys = fix_output.with_heading(keys, at_place, at_place.place)
+    check = None if told is None else told.compared
     about = ("status", "distance_m", "bearing_deg", "sigma_m")
     return keys | {"gnss": None if check is None else {name: getattr(check, name) for name in about}}
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from starpos.detection.saturated import round_shape
 from starpos.frames.frame import Disc
 
 # Frames are searched at steps of their shorter side over this, px, or of 2. Minimum radius, px, and number of bright
@@ -233,16 +234,10 @@ def _glow(plane: np.ndarray, middle: np.ndarray, extent: float, dark: float, hei
         x0, y0, width, length = cv2.boundingRect(outline)
         if not (x0 > 0 and y0 > 0 and x0 + width < part.shape[1] and y0 + length < part.shape[0]):
             return None
-        filled = cv2.drawContours(np.zeros(part.shape, np.uint8), [outline], -1, 1, cv2.FILLED)
-        rows, columns = np.nonzero(filled)
-        spread = np.linalg.eigvalsh(np.cov(columns, rows))
-        area = len(rows)
-        if spread[0] <= 0 or spread[1] > LONGEST * spread[0]:
+        if (one := round_shape(outline, LONGEST, FULLEST)) is None:
             return None
-        if area < FULLEST * 4 * np.pi * np.sqrt(spread.prod()):
-            return None
-        found.append((left + columns.mean(), top + rows.mean(), np.sqrt(area / np.pi)))
-    x, y, radii = np.array(found).T
+        found.append(one)
+    x, y, radii = np.array(found).T + np.array([[left], [top], [0]])
     radius = float(radii[0])
     if radii[-1] < HALO * radius:
         return None

@@ -80,28 +80,36 @@ def _disc(
     if number < 2:
         return None
     k = 1 + int(boxes[1:, cv2.CC_STAT_AREA].argmax())
-    x0, y0, width, height, area = boxes[k]
+    x0, y0, width, height, _ = boxes[k]
     if x0 == 0 or y0 == 0 or x0 + width == window.shape[1] or y0 + height == window.shape[0]:
         return None
     if width * height <= np.pi * least**2:
         return None
-    # holes, as some sensors have where they overflow, count
     outline, _ = cv2.findContours(
         window[y0 : y0 + height, x0 : x0 + width], cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
     )
-    filled = cv2.drawContours(np.zeros((height, width), np.uint8), [max(outline, key=len)], -1, 1, cv2.FILLED)
+    found = round_shape(max(outline, key=len), LONGEST, FULLEST)
+    if found is None or found[2] <= least:
+        return None
+    return left + x0 + found[0], top + y0 + found[1], found[2]
+
+
+def round_shape(outline: np.ndarray, longest: float, fullest: float) -> tuple[float, float, float] | None:
+    """Middle x, y and radius (px) of the pixels within an outline of OpenCV's; None if they are not round.
+
+    Holes, as some sensors have where they overflow, count.  longest: ratio of the squared axes of the ellipse of their
+    moments; fullest: share of its area that they cover.
+    """
+    left, top, width, height = cv2.boundingRect(outline)
+    filled = np.zeros((height, width), np.uint8)
+    cv2.drawContours(filled, [outline], -1, 1, cv2.FILLED, offset=(-left, -top))
     rows, columns = np.nonzero(filled)
-    area = len(rows)
-    if area <= np.pi * least**2:
+    if len(rows) < 2:
         return None
-    spread = np.linalg.eigvalsh(np.cov(columns, rows))
-    if (
-        spread[0] <= 0
-        or spread[1] > LONGEST * spread[0]
-        or area < FULLEST * 4 * np.pi * np.sqrt(spread.prod())
-    ):
+    low, high = np.linalg.eigvalsh(np.cov(columns, rows))
+    if low <= 0 or high > longest * low or len(rows) < fullest * 4 * np.pi * np.sqrt(low * high):
         return None
-    return left + x0 + columns.mean(), top + y0 + rows.mean(), float(np.sqrt(area / np.pi))
+    return left + float(columns.mean()), top + float(rows.mean()), float(np.sqrt(len(rows) / np.pi))
 
 
 def measured_discs(

@@ -93,11 +93,6 @@ class SecondLook:
     window: Window | None
     fwhm_px: float | None
 
-    @classmethod
-    def of(cls, frame: Frame, stars: Stars) -> "SecondLook":
-        """The second look at a frame whose stars were detected."""
-        return cls(frame, stars.window, stars.fwhm_px)
-
     @cached_property
     def _kernel(self) -> Kernel:
         sigma = min(max(SHARP.sigma, (self.fwhm_px or 0.0) / FWHM_PER_SIGMA), WIDEST_SIGMA)

@@ -108,9 +108,9 @@ def _altitude_text(sine: float) -> str:
 # A trail of which this much more than the stars' width (times it, and px) is missing; and the smallest width of a trail
 # across, px, for which the detector's FWHM is the geometric mean of length and width.
 TRAIL_WIDTHS, TRAIL_PX, ACROSS_PX = 3.0, 3.0, 0.8
-# The same by the stars' shapes, where they are measured: a trail this many times as long as wide would be seen, and
-# shapes that are circles to this share are not measured.
-LONGER_THAN_WIDE, SHAPELESS = 1.5, 1e-6
+# The same by the stars' shapes, which the detector's covariances have: a trail that is this many times as long as wide
+# is missed where the stars have less than this share of what it would add.
+LONGER_THAN_WIDE, MISSED_SHARE = 1.15, 0.3
 # (FWHM / length)^2 of the normal curve with a trail's variance
 TRAIL_VARIANCE = 8 * math.log(2) / 12
 
@@ -125,7 +125,7 @@ def check_exposure(stars: Stars, camera: Camera, directions: np.ndarray) -> None
     across_pole = math.sqrt(1 - float(np.mean(directions[:, 2] ** 2)))
     trail_px = ROTATION_RAD_S * stars.exposure_s * across_pole * camera.fx
     too_narrow = trail_px > max(TRAIL_WIDTHS * stars.fwhm_px + TRAIL_PX, stars.fwhm_px**2 / ACROSS_PX)
-    if too_narrow or _too_round(stars, trail_px):
+    if too_narrow or _too_round(stars.covariance, stars.fwhm_px**2, trail_px):
         raise FixError(
             f"{stars.place}: its stars are points of {stars.fwhm_px:.1f} px (FWHM), and an exposure of "
             f"{stars.exposure_s:g} s of a camera at rest makes trails of {trail_px:.0f} px: its exposure time is wrong "
@@ -134,16 +134,16 @@ def check_exposure(stars: Stars, camera: Camera, directions: np.ndarray) -> None
         )
 
 
-def _too_round(stars: Stars, trail_px: float) -> bool:
-    """Whether star images, whose errors along and across are as their widths, are far rounder than such trails are."""
-    small, large = np.linalg.eigvalsh(stars.covariance).T
-    if not len(small) or np.all(large < (1 + SHAPELESS) * small):
+def _too_round(covariance: np.ndarray, area: float, trail_px: float) -> bool:
+    """Whether the stars are far rounder than trails: their errors along and across are as their lengths and widths."""
+    if not np.any(covariance[:, 0, 1]):
         return False
+    small, large = np.linalg.eigvalsh(covariance).T
     longer = math.sqrt(float(np.median(large / small)))
     # a trail's area is the measured one; along it the variances of star and trail add up
-    area, more = stars.fwhm_px**2, TRAIL_VARIANCE * trail_px**2
+    more = TRAIL_VARIANCE * trail_px**2
     expected = area / (0.5 * (math.hypot(more, 2 * area) - more))
-    return expected > LONGER_THAN_WIDE and longer < math.sqrt(expected)
+    return expected > LONGER_THAN_WIDE and longer - 1 < MISSED_SHARE * (expected - 1)
 
 
 # a camera at rest gets beyond it once in 900 frames

@@ -203,7 +203,7 @@ def look_at(item: Frame | Stars, stars: Stars) -> "SecondLook | None":
         return None
     from starpos.detection.second_look import SecondLook, negative_of
 
-    return SecondLook.of(negative_of(item) if stars.negative else item, stars)
+    return SecondLook(negative_of(item) if stars.negative else item, stars.window, stars.fwhm_px)
 
 
 def _another(

@@ -96,12 +96,10 @@ class StarAdjustment:
         by_scale = self._pixels(v, scale, self.refraction) - [self.camera.cx, self.camera.cy]
         return np.stack([*(ahead - behind) / (2 * STEP_RAD), by_scale], -1)
 
-    def refined(
-        self, a4: np.ndarray, scale: float, gain: np.ndarray
-    ) -> tuple[np.ndarray, float, np.ndarray | None]:
+    def refined(self, a4: np.ndarray, scale: float, gain: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
         """The best estimate near one, by Gauss-Newton with the gain (4, N, 2) of the stars' places.
 
-        Returns also the residuals (N, 2), predicted minus seen px, before the last step; None if it did not converge.
+        Returns also the residuals (N, 2), predicted minus seen px, before the last step; FixError if none is the last.
         """
         for _ in range(MAX_STEPS):
             residual = self.predict(a4, scale) - self.xy
@@ -111,7 +109,7 @@ class StarAdjustment:
             a4, scale = rotation.from_vector(step[:3]) @ a4, scale * (1 + step[3])
             if np.abs(step).max() < SETTLED:
                 return a4, scale, residual
-        return a4, scale, None
+        raise FixError("the identified stars do not fit into the camera's field: check focal length and tilt")
 
     def _upward(self, a4: np.ndarray) -> np.ndarray:
         """Unrefracted directions (N, 3) in L."""
@@ -143,10 +141,6 @@ def fitted(problem: StarAdjustment, local: np.ndarray, stated: np.ndarray) -> Fi
             )
         gain = gain_of(slope * keep[:, None, None], stated + ISOTROPIC * jitter2)
         a4, scale, residual = problem.refined(a4, scale, gain)
-        if residual is None:
-            raise FixError(
-                "the identified stars do not fit into the camera's field: check focal length and tilt"
-            )
         if settled:
             break
         before = keep, jitter2

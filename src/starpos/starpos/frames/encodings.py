@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pixels in an image message, by the name of their encoding.
 
-The names are from sensor_msgs/image_encodings.hpp, with cv_bridge's numbers of a type (`16UC1`), in upper or lower case.
+The names are from sensor_msgs/image_encodings.hpp, with cv_bridge's numbers of a type (`16UC1`), and GenICam's of
+packed pixels (Pixel Format Naming Convention: `Mono12p`; GigE Vision: `Mono12Packed`), in upper or lower case.
 """
 
 from collections.abc import Callable
@@ -23,19 +24,20 @@ class Encoding:
     """How pixels lie in a row.
 
     dtype     of a number of the row
-    numbers   of a pixel in the row
-    convert   takes the rows (h, w, numbers), or (h, w) of one number; returns the pixels of a Frame
+    numbers   of a pixel in the row; a fraction where pixels are packed into bytes
+    convert   takes the rows (h, w, numbers), or (h, w) of one number, or (h, bytes) of packed pixels; returns the pixels
+              of a Frame, with the padding of packed rows
     pattern   of a colour mosaic, as a Frame's
     """
 
     dtype: type[np.generic] = np.uint8
-    numbers: int = 1
+    numbers: float = 1
     convert: Callable[[np.ndarray], np.ndarray] | None = None
     pattern: str = ""
 
     def row_bytes(self, width: int) -> int:
         """Bytes of a row of `width` pixels, without padding."""
-        return width * self.numbers * np.dtype(self.dtype).itemsize
+        return -int(-width * self.numbers * np.dtype(self.dtype).itemsize // 1)
 
 
 def pixels_of(
@@ -65,14 +67,17 @@ def pixels_of(
             f"{place}: {len(data)} bytes of pixels for {height} rows of {step} bytes; "
             "the frame is truncated or its sizes are wrong."
         )
-    rows = _rows(layout, data, (width, height, step), big_endian)
-    return (layout.convert(rows) if layout.convert else rows), layout.pattern
+    rows = _rows(layout, data, (row, width, height, step), big_endian)
+    return (layout.convert(rows)[:, :width] if layout.convert else rows), layout.pattern
 
 
-def _rows(layout: Encoding, data: bytes, sizes: tuple[int, int, int], big_endian: bool) -> np.ndarray:
-    """The numbers in the rows: (h, w, numbers), or (h, w) of one number."""
-    (width, height, step), numbers = sizes, layout.numbers
+def _rows(layout: Encoding, data: bytes, sizes: tuple[int, int, int, int], big_endian: bool) -> np.ndarray:
+    """The numbers in the rows: (h, w, numbers), (h, w) of one number, (h, bytes) where pixels are packed."""
+    row, width, height, step = sizes
     dtype = np.dtype(layout.dtype).newbyteorder(">" if big_endian else "<")
+    numbers = int(layout.numbers)
+    if numbers != layout.numbers:
+        return np.ndarray((height, row), np.uint8, data, strides=(step, 1))
     shape = (height, width) if numbers == 1 else (height, width, numbers)
     strides = (step, dtype.itemsize) if numbers == 1 else (step, numbers * dtype.itemsize, dtype.itemsize)
     rows: np.ndarray = np.ndarray(shape, dtype, data, strides=strides)
@@ -112,6 +117,46 @@ def _brightness(place: int) -> Callable[[np.ndarray], np.ndarray]:
     return convert
 
 
+def _in_groups(rows: np.ndarray, size: int) -> np.ndarray:
+    """Bytes (h, groups, size) of rows (h, bytes), the last group filled up with zeros."""
+    height, length = rows.shape
+    whole = np.zeros((height, -(-length // size) * size), np.uint16)
+    whole[:, :length] = rows
+    return whole.reshape(height, -1, size)
+
+
+def _bit_stream(bits: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Pixels of 10 or 12 bits one after another, the low bits first (`Mono10p`, `Mono12p`)."""
+    # the fewest bytes that hold whole pixels
+    size, count = (5, 4) if bits == 10 else (3, 2)
+
+    def convert(rows: np.ndarray) -> np.ndarray:
+        groups = _in_groups(rows, size)
+        out = np.empty((*groups.shape[:2], count), np.uint16)
+        for k in range(count):
+            byte, shift = divmod(bits * k, 8)
+            out[:, :, k] = (groups[:, :, byte] >> shift | groups[:, :, byte + 1] << 8 - shift) & (
+                1 << bits
+            ) - 1
+        return out.reshape(len(rows), -1)
+
+    return convert
+
+
+def _gige_vision(bits: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Two pixels in three bytes: high bits, low bits of both, high bits (`Mono10Packed`, `Mono12Packed`)."""
+    low = bits - 8
+
+    def convert(rows: np.ndarray) -> np.ndarray:
+        groups = _in_groups(rows, 3)
+        out = np.empty((*groups.shape[:2], 2), np.uint16)
+        out[:, :, 0] = groups[:, :, 0] << low | groups[:, :, 1] & (1 << low) - 1
+        out[:, :, 1] = groups[:, :, 2] << low | groups[:, :, 1] >> 4 & (1 << low) - 1
+        return out.reshape(len(rows), -1)
+
+    return convert
+
+
 def _of_type(
     name: str, dtype: type[np.generic], one: Callable | None, three: Callable | None
 ) -> dict[str, Encoding]:
@@ -120,6 +165,15 @@ def _of_type(
         name: Encoding(dtype, 1, one),
         f"{name}C1": Encoding(dtype, 1, one),
         f"{name}C3": Encoding(dtype, 3, three),
+    }
+
+
+def _packed(name: str, pattern: str) -> dict[str, Encoding]:
+    return {
+        f"{name}10p": Encoding(np.uint8, 1.25, _bit_stream(10), pattern),
+        f"{name}12p": Encoding(np.uint8, 1.5, _bit_stream(12), pattern),
+        f"{name}10packed": Encoding(np.uint8, 1.5, _gige_vision(10), pattern),
+        f"{name}12packed": Encoding(np.uint8, 1.5, _gige_vision(12), pattern),
     }
 
 
@@ -150,4 +204,6 @@ ENCODINGS: dict[str, Encoding] = {
     "nv24": Encoding(),
     "mono10": Encoding(np.uint16),
     "mono12": Encoding(np.uint16),
+    **_packed("mono", ""),
+    **{name: e for p in MOSAICS for name, e in _packed(f"bayer{p[:2]}", p).items()},
 }

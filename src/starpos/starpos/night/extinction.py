@@ -22,6 +22,8 @@ LOWEST_DEG, FEWEST = 5.0, 60
 PATCHES, FEWEST_PATCHES = 4, 15
 # an error (mag per air mass) beyond which it is unknown; so it is where brightness does not follow light to this share
 UNKNOWN_MAG, LINEAR = 0.1, 0.2
+# share by which the air mass of low stars may differ from the law of any night
+LAW = 0.05
 ROUNDS = 10
 
 
@@ -83,4 +85,4 @@ def extinction(lights: Sequence[Light]) -> tuple[float, float]:
     sigma = np.sqrt(free * np.diag(inverse @ pulls.T @ pulls @ inverse))
     if sigma[0] > UNKNOWN_MAG or abs(found[1] - 1) > LINEAR or found[0] < -2 * sigma[0]:
         return unknown
-    return float(found[0]), float(sigma[0])
+    return float(found[0]), float(np.hypot(sigma[0], LAW * found[0]))

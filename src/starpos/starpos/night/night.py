@@ -4,6 +4,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +16,9 @@ from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import FieldPointing, Solution, Status
 from starpos.frames.frame import Stars
 from starpos.night.remarks import Remark
-from starpos.night.together import WatchedNight
+
+if TYPE_CHECKING:
+    from starpos.night.beside_gnss import WatchedNight
 
 NO_TILT = (float("nan"), float("nan"))
 NO_STARS = np.zeros((0, 2))
@@ -158,7 +161,7 @@ class Night:
     atmosphere: Atmosphere
     truth: Truth | None = None
     steady: np.ndarray | None = None
-    watched: WatchedNight | None = None
+    watched: "WatchedNight | None" = None
     remarks: tuple[Remark, ...] = ()
 
     @property

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from starpos.frames.frame import Frame, Stars
 from starpos.frames.gravity import PHONE
 from starpos.frames.reading import FITS, HEIF, JPEG, PICTURE, RAW, are_photographs
 from starpos.frames.tables import GNSS, SIMULATED, TILTS, TRUTH
-from starpos.gnss.receiver import GnssTrack, read_gnss_csv
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.instrument import ByGravity, Calibration, Instrument
 from starpos.instrument.phone_log import is_phone_log
@@ -29,10 +28,12 @@ from starpos.night.night import Night, Truth
 from starpos.night.reading import About, First, Instruments, Reader, TiltFile
 from starpos.night.remarks import Remark, of_gravity, of_tilts
 from starpos.night.solving import Exposures, How, Worked, solved_night
-from starpos.night.together import Receiver
 from starpos.night.work import OnFile, Solving
 from starpos.parallel.processes import Here
 from starpos.progress import Progress, quiet
+
+if TYPE_CHECKING:
+    from starpos.gnss.receiver import GnssTrack
 
 TRUTH_LIMIT = 1 << 26
 
@@ -228,7 +229,7 @@ class NightOnDisk:
         turn_stddev_deg: float = 180.0,
         progress: Progress = quiet,
         *,
-        gnss: str | Path | GnssTrack | None = None,
+        gnss: "str | Path | GnssTrack | None" = None,
     ) -> Night:
         """The place, and the fix of each frame; a frame's fault is its status.
 
@@ -251,10 +252,15 @@ class NightOnDisk:
             model, errors = sensors.find(self.inclinometer)
             given = replace(given, inclinometer=errors, inclinometer_model=model)
         instruments = Instruments(given, by_header=self.instrument is None, sought=sought)
-        track = read_gnss_csv(gnss)[0] if isinstance(gnss, (str, Path)) else gnss
+        receiver = None
+        if gnss is not None:
+            from starpos.gnss.receiver import read_gnss_csv
+            from starpos.night.beside_gnss import Receiver
+
+            receiver = Receiver(read_gnss_csv(gnss)[0] if isinstance(gnss, (str, Path)) else gnss)
         return solved_night(
             exposures(self.folder, instruments, self.atmosphere, self.vertical, self.place),
-            How(turn_stddev_deg if self_calibrate else None, None if track is None else Receiver(track)),
+            How(turn_stddev_deg if self_calibrate else None, receiver),
             progress,
         )
 

@@ -6,7 +6,7 @@ Frames are solved one by one, or all together: by turning, or compared with GNSS
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,16 +27,16 @@ from starpos.night.remarks import Remark
 from starpos.night.together import (
     FrameAnswer,
     Gathered,
-    Receiver,
     TurnedNight,
-    WatchedNight,
     together,
     turned,
-    watched_night,
 )
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
 from starpos.rotation import half_turns
+
+if TYPE_CHECKING:
+    from starpos.night.beside_gnss import Receiver, WatchedNight
 
 # if readings are further from their median than this, the camera was moved
 STILL_SIGMA = 8.0
@@ -72,7 +72,7 @@ class How:
     """
 
     turn_stddev_deg: float | None = None
-    receiver: Receiver | None = None
+    receiver: "Receiver | None" = None
 
     @property
     def one_by_one(self) -> bool:
@@ -99,7 +99,7 @@ class NightAnswers:
     instrument: Instrument | None = None
     given: Instrument | None = None
     turned: TurnedNight | None = None
-    watched: WatchedNight | None = None
+    watched: "WatchedNight | None" = None
 
 
 def answers_of(
@@ -120,6 +120,8 @@ def answers_of(
     solver = replace(asked.solver(seen[0].stars), progress=progress)
     solver, alike = of_one_camera(solver, seen)
     if how.receiver is not None:
+        from starpos.night.beside_gnss import watched_night
+
         watched = watched_night(solver, alike, asked.tilts, how.receiver, vertical)
         answers = [
             FrameAnswer("", a.solution, s.stars, a) for a, s in zip(watched.answers, alike, strict=True)

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a night's frames give together: an average, A3 by turning, a place from elevations, what GNSS teaches; and
-doubts.
-"""
+"""What a night's frames give together: an average, A3 by turning, a place from elevations; and doubts."""
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,23 +13,21 @@ from starpos.averaging.average import Average, average
 from starpos.averaging.elevation_axis import MIN_WITHOUT_SITE, FoundAxis, find_axis
 from starpos.calibration.misalignment import Calibrated, turn
 from starpos.earth.place import Place
-from starpos.earth.vertical import Vertical
-from starpos.errors import FixError, FrameError, GnssError, StarposError
+from starpos.errors import FixError, FrameError, StarposError
 from starpos.fix.circle import Circle, circle_of
 from starpos.fix.fix import IDEAL, Fix
 from starpos.fix.searching import Sight
 from starpos.fix.solution import Solution, Status
-from starpos.fix.solver import Solver, placed
+from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
-from starpos.gnss.receiver import GnssTrack
-from starpos.gnss.solving import Watched, watched
-from starpos.gnss.states import Learned
-from starpos.gnss.watch import GnssWatch
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
 from starpos.night.remarks import Near, Remark, doubts, of_inclinometer
+
+if TYPE_CHECKING:
+    from starpos.gnss.solving import Watched
 
 # elevations that have A3's axis further from where it was given, in sigma of both, deny the given one
 DENIED_SIGMA = 6.0
@@ -48,7 +44,7 @@ class FrameAnswer:
     name: str
     solution: Solution
     stars: Stars | None = None
-    watched: Watched | None = None
+    watched: "Watched | None" = None
     readable: bool = True
 
     @classmethod
@@ -296,48 +292,3 @@ def circles_of(solver: Solver, pointings: Sequence[Pointing], tilts: Tilts) -> l
         except StarposError as error:
             circles.append(error)
     return circles
-
-
-@dataclass(frozen=True)
-class Receiver:
-    """The GNSS places of a night, and what earlier nights learned of the instrument; None where nothing."""
-
-    track: GnssTrack
-    learned: Learned | None = None
-
-
-@dataclass(frozen=True)
-class WatchedNight:
-    """The answer to each frame in the given order; what GNSS taught by the end; remarks."""
-
-    answers: tuple[Watched, ...]
-    learned: Learned | None
-    remarks: tuple[Remark, ...]
-
-
-def watched_night(
-    solver: Solver, sights: Sequence[Sight], tilts: Tilts | None, receiver: Receiver, vertical: Vertical
-) -> WatchedNight:
-    """Solve a night's frames, which are identified already, in the order of their times.
-
-    tilts: None where headings alone are wanted.
-    """
-    watch = GnssWatch(solver.instrument, vertical, receiver.learned)
-    said: Counter[str] = Counter()
-    answers: dict[int, Watched] = {}
-    for k in sorted(range(len(sights)), key=lambda k: sights[k].stars.mid_unix_s or 0.0):
-        stars, rough, gnss = sights[k].stars, sights[k].solution, None
-        if stars.mid_unix_s is not None:
-            try:
-                gnss = receiver.track.at(stars.mid_unix_s)
-            except GnssError as error:
-                said[str(error)] += 1
-        if rough.found is not None and tilts is not None:
-            solved = solver.solve(stars, tilts, known=rough.found)
-            refused = replace(rough, status=solved.status, message=solved.message)
-            rough = refused if solved.found is None else solved
-        if gnss is not None:
-            rough = placed(solver, stars, rough, gnss.deflected(vertical))
-        answers[k] = watched(solver, stars, rough, gnss, watch)
-    remarks = tuple(Remark(f"{number} frames: {why}") for why, number in said.items())
-    return WatchedNight(tuple(answers[k] for k in range(len(sights))), watch.learned, remarks)

@@ -152,12 +152,12 @@ class Adjuster:
         by_hand = self.by_hand[:, None, None] * np.eye(2)
         return residual, np.concatenate([by_place, by_clock[..., None], by_hand], -1), by_offset
 
-    def solve(self, start: np.ndarray, clock_s: float = 0.0, *, refuse: bool = True) -> PlaceAdjustment:
-        """Adjust from a place (3,) in ITRS near the truth; refuse: leave out what does not fit."""
+    def solve(self, start: np.ndarray, clock_s: float = 0.0) -> PlaceAdjustment:
+        """Adjust from a place (3,) in ITRS near the truth, and leave out what does not fit."""
         used = np.ones(len(self.time_stddev), bool)
         while True:
             answer, blocks, step = self._adjusted(start, clock_s, used)
-            worst = self._worst(used, blocks, step, answer.covariance / answer.scale) if refuse else None
+            worst = self._worst(used, blocks, step, answer.covariance / answer.scale)
             if worst is None:
                 return answer
             used = used & ~worst

@@ -193,7 +193,7 @@ class Catalogue:
 
     @cached_property
     def cell_start(self) -> np.ndarray:
-        """First row of each cell, as `zones.cell_starts` returns it."""
+        """First row of each cell, as `cell_starts` returns it."""
         return cell_starts(self.zone_start, self.ra_mas * MAS_DEG)
 
     def vmag(self, index: Rows = slice(None)) -> np.ndarray:
@@ -240,14 +240,10 @@ class Catalogue:
         return NamedStars(len(index), partial(self.labels, index))
 
     def labels(self, index: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
-        """Names and V magnitudes (n,) of the rows `index` (n,)."""
+        """Names ('HIP 1234', or 'TYC 1-2-3' without a Hipparcos number) and V magnitudes (n,) of rows `index` (n,)."""
         numbers = zip(self.hip[index].tolist(), self.tyc[index].tolist(), strict=True)
         names = (f"HIP {hip}" if hip else f"TYC {one}-{two}-{three}" for hip, (one, two, three) in numbers)
         return tuple(names), self.vmag(index)
-
-    def names(self, index: np.ndarray) -> tuple[str, ...]:
-        """Designations of the rows `index`: 'HIP 1234', or 'TYC 1-2-3' for a star without a Hipparcos number."""
-        return self.labels(index)[0]
 
     def cone(self, centre: np.ndarray, radius_rad: float, limit_mag: float = np.inf) -> np.ndarray:
         """Rows of the stars within radius_rad of the unit vector `centre` (3,) at J2000, brightest first."""

@@ -52,7 +52,7 @@ def test_stars_too_faint_to_be_detected_stand_out(rng):
     stars = grid(SIZE, 70, 65, rng)
     frame = Frame(noisy(field(SIZE, stars), rng))
     found = detect(frame).stars
-    sigmas, snr = SecondLook.of(frame, found)(stars[:, 0], stars[:, 1])
+    sigmas, snr = SecondLook(frame, found.window, found.fwhm_px)(stars[:, 0], stars[:, 1])
     assert len(found) < 0.2 * len(stars)
     assert np.nanmean(sigmas) > 1.3
     assert 1.3 < np.nanmean(snr) < 5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels of image messages by their encoding, against OpenCV's conversions."""
+"""Pixels of image messages by their encoding, against OpenCV's conversions and bits packed one by one."""
 
 import cv2
 import numpy as np
@@ -110,6 +110,36 @@ def test_of_planes_the_brightness_is_taken(name):
     assert np.array_equal(got, BGR[:, :, 0])
 
 
+def bit_stream(values, bits):
+    """PFNC's packing: bit k of the stream is bit k % 8 of byte k // 8, the low bits of a pixel first."""
+    stream = (values[:, :, None] >> np.arange(bits)) & 1
+    return np.packbits(stream.reshape(len(values), -1).astype(np.uint8), axis=1, bitorder="little")
+
+
+def gige_vision(values, bits):
+    """GigE Vision's: high bits of the first, low bits of both (the second's above), high bits of the second."""
+    out = []
+    for row in values.tolist():
+        packed = []
+        for k in range(0, len(row), 2):
+            first, second = row[k], row[k + 1] if k + 1 < len(row) else 0
+            low = (1 << bits - 8) - 1
+            packed += [first >> bits - 8, first & low | (second & low) << 4, second >> bits - 8]
+        # an odd last pixel has no third byte
+        out.append(packed[: -(-len(row) * 3 // 2)])
+    return np.array(out, np.uint8)
+
+
+@pytest.mark.parametrize("name", ["Mono", "BayerRG", "BayerGB"])
+@pytest.mark.parametrize("bits", [10, 12])
+@pytest.mark.parametrize(("suffix", "pack"), [("p", bit_stream), ("Packed", gige_vision)])
+def test_packed_pixels(name, bits, suffix, pack):
+    values = GREY >> 12 - bits
+    got, pattern = decoded(f"{name}{bits}{suffix}", pack(values, bits))
+    assert got.dtype == np.uint16 and np.array_equal(got, values)
+    assert pattern == {"Mono": "", "BayerRG": "rggb", "BayerGB": "gbrg"}[name]
+
+
 def test_every_channel_of_8_and_16_bits_that_cv_bridge_knows():
     for kind in ("8U", "8S", "16U", "16S"):
         for channels in (1, 3):
@@ -127,6 +157,7 @@ def test_every_channel_of_8_and_16_bits_that_cv_bridge_knows():
         ({"step": 2 * W - 1}, "needs 14"),
         ({"width": 2**32 - 1}, "step"),
         ({"step": 2**32 - 1}, "truncated"),
+        ({"encoding": "mono12p", "step": 10}, "needs 11"),
     ],
 )
 def test_what_does_not_fit_together_is_refused(change, word):

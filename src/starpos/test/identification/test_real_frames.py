@@ -55,7 +55,7 @@ def test_all_are_identified_and_look_where_they_look(answers):
 
 def test_as_many_stars_as_astrometry_net_and_of_as_many_residuals_no_larger(answers, catalogue):
     """On the same terms: of as many, the brightest, after a fit of six parameters, as theirs is."""
-    row_of = {name: k for k, name in enumerate(catalogue.names(np.arange(len(catalogue))))}
+    row_of = {name: k for k, name in enumerate(catalogue.labels(np.arange(len(catalogue)))[0])}
     for row, stars, s, _ in solved(answers):
         n = int(row["nmatch"])
         assert len(s.names) >= n, row["file"]

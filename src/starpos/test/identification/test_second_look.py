@@ -46,7 +46,8 @@ def answers(solver, catalogue, frames, rng, **more):
         frame = exposed(catalogue, attitude, rng, **more)
         stars = detect(frame).stars
         alone = solver.identify(stars)
-        yield attitude, alone, alone if alone.ok else solver.look_again(stars, SecondLook.of(frame, stars))
+        look = SecondLook(frame, stars.window, stars.fwhm_px)
+        yield attitude, alone, alone if alone.ok else solver.look_again(stars, look)
 
 
 def is_right(solution, attitude):

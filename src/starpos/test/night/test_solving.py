@@ -18,9 +18,10 @@ from starpos.fix.solver import Solver
 from starpos.gnss.receiver import GnssTrack
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, TiltsByTime
+from starpos.night.beside_gnss import Receiver
 from starpos.night.reading import Instruments
 from starpos.night.solving import ONE_BY_ONE, Exposures, How, answers_of, solved_night
-from starpos.night.together import Gathered, Receiver, together, turned
+from starpos.night.together import Gathered, together, turned
 from starpos.night.work import Solving
 from starpos_testing.skies.scenes import (
     AIR,

@@ -184,8 +184,8 @@ def test_bright_stars_come_from_the_supplement(catalogue):
 def test_names(catalogue):
     sirius = np.flatnonzero(catalogue.hip == 32349)
     unnamed = np.flatnonzero(catalogue.hip == 0)[:1]
-    assert catalogue.names(sirius) == ("HIP 32349",)
-    assert catalogue.names(unnamed)[0] == "TYC {}-{}-{}".format(*catalogue.tyc[unnamed[0]])
+    assert catalogue.labels(sirius)[0] == ("HIP 32349",)
+    assert catalogue.labels(unnamed)[0][0] == "TYC {}-{}-{}".format(*catalogue.tyc[unnamed[0]])
 
 
 def test_size_of_the_committed_catalogue(catalogue):
@@ -318,5 +318,5 @@ def test_named_stars_are_looked_up_late_and_sent_without_their_catalogue(catalog
     sent = pickle.dumps(named)
     assert len(sent) < 1000 and pickle.loads(sent) == named
     some = named.of_rows(np.array([3, 1]))
-    assert some.labels[0] == catalogue.names(index[[3, 1]])
+    assert some.labels[0] == catalogue.labels(index[[3, 1]])[0]
     assert some != named and some == catalogue.named(index[[3, 1]])
