@@ -19,7 +19,7 @@ from starpos.fix.attitude import CAMERA, ENU, Attitude, heading_row
 from starpos.fix.budget import Circumstances, link_attitude, mount_term, sky_terms
 from starpos.fix.checks import check_visible
 from starpos.fix.sighting import FittedSighting, fitted_fields
-from starpos.fix.star_fit import MatchedStars, StarAdjustment, StarFit, apparent, fit_stars
+from starpos.fix.star_fit import StarAdjustment, MatchedStars, StarFit, apparent, fit_stars
 from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
 from starpos.frozen import at_once
 from starpos.identification import fisheye
