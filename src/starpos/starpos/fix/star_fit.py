@@ -64,8 +64,8 @@ class Fitted:
 
 
 @at_once
-@dataclass(frozen=True, kw_only=True)
-class StarAdjustment:
+@dataclass(frozen=True)
+class Adjustment:
     """Stars that a camera sees, and where an estimate of its attitude has them.
 
     xy (N, 2): px, where they are seen.  itrs (N, 3): their directions, along the axes which A4 takes into L.
@@ -124,7 +124,7 @@ class StarAdjustment:
         return c.lens.places(refraction.bend(v) @ self.g) * [scale * c.fx, scale * c.fy] + [c.cx, c.cy]
 
 
-def fitted(problem: StarAdjustment, local: np.ndarray, stated: np.ndarray) -> Fitted:
+def fitted(problem: Adjustment, local: np.ndarray, stated: np.ndarray) -> Fitted:
     """The fit of the stars, from a closed solution by Gauss-Newton over the rotation A4 and the plate scale.
 
     The derivatives are computed once: they hardly change over the remaining arcseconds.
@@ -313,7 +313,7 @@ class StarFit:
     residual (M, 2): fitted places minus seen places, px.
     """
 
-    problem: StarAdjustment
+    problem: Adjustment
     fit: Fitted
     errors: StarErrors
     residual: np.ndarray
@@ -389,7 +389,7 @@ def fit_stars(
 
     Raises FixError if the stars are too few or do not agree.
     """
-    problem = StarAdjustment(xy=stars.xy, itrs=itrs, g=g, camera=camera, refraction=refraction)
+    problem = Adjustment(stars.xy, itrs, g, camera, refraction)
     catalogue_px2 = ISOTROPIC * ((stars.place_sigma * camera.fx) ** 2)[:, None, None]
     stated = stars.covariance_px2 + catalogue_px2
     fit = fitted(problem, refraction.unbend(camera.directions(*stars.xy.T) @ g.T), stated)
@@ -401,14 +401,12 @@ def fit_stars(
     return _with_errors(problem, fit, stars.covariance_px2, catalogue_px2, stars.index)
 
 
-def seen_problem(xy: np.ndarray, camera: Camera, seen: np.ndarray) -> StarAdjustment:
+def seen_problem(xy: np.ndarray, camera: Camera, seen: np.ndarray) -> Adjustment:
     """The problem of N stars at xy (N, 2) px whose light comes from the directions seen (N, 3) along any axes.
 
     Nothing bends it on its way: A4 takes these axes into C.
     """
-    return StarAdjustment(
-        xy=xy, itrs=seen, g=np.eye(3), camera=camera, refraction=BENT_ALREADY, on_ground=False
-    )
+    return Adjustment(xy, seen, np.eye(3), camera, BENT_ALREADY, on_ground=False)
 
 
 def fit_seen(xy: np.ndarray, stated: np.ndarray, camera: Camera, seen: np.ndarray) -> StarFit:
@@ -422,7 +420,7 @@ def fit_seen(xy: np.ndarray, stated: np.ndarray, camera: Camera, seen: np.ndarra
 
 
 def _with_errors(
-    problem: StarAdjustment,
+    problem: Adjustment,
     fit: Fitted,
     centroids_px2: np.ndarray,
     catalogue_px2: np.ndarray,

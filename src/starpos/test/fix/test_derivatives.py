@@ -12,7 +12,7 @@ from starpos._numeric.roots import symmetric_root
 from starpos.earth.orientation import station_velocity
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
 from starpos.fix.budget import StarErrors, gain_of
-from starpos.fix.star_fit import StarAdjustment, distance2, expected_extra, fitted, judged
+from starpos.fix.star_fit import Adjustment, distance2, expected_extra, fitted, judged
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.units import MEDIAN_OF_CHI2
 
@@ -40,11 +40,7 @@ def problem_of(camera, off_zenith_rad, rng, stars=40):
     air = Atmosphere().refraction()
     a4 = rotation.from_vector(rng.normal(0, 1, 3))
     local = air.unbend(v @ g.T)
-    return (
-        StarAdjustment(xy=camera.project(v), itrs=local @ a4, g=g, camera=camera, refraction=air),
-        a4,
-        local,
-    )
+    return Adjustment(camera.project(v), local @ a4, g, camera, air), a4, local
 
 
 def bent(v):
