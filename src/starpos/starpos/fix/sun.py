@@ -7,7 +7,7 @@ lamp, and makes the attitude better than by either. Without a place one frame gi
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -150,25 +150,29 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
         if not disc.sharp:
             sigma = float(np.linalg.norm(seen.own)) / math.sqrt(2)
             glow = Glow(state.utc_unix_s, seen.ray, sun, sigma)
-        looked = partial(_looks, solver, stars, disc, camera=camera, state=state)
+        looked = partial(_looks, solver, stars, camera=camera, state=state)
         apart = bool(np.linalg.norm(sun - moon) > NEAREST)
-        both = disc.other is not None and apart
-        if places is None:
+        place = None if places is None else places.at(state.utc_unix_s)
+        both: tuple[str, ...] = BOTH if disc.other is not None and apart else ()
+        discs: tuple[Disc | None, ...] = disc, disc.other
+        if not both and disc.sharp:
+            both, discs = _with_planet(solver, stars, disc, looked, tilt, place, state, stamp_s)
+        if place is None:
             if both:
                 with suppress(PlaceError):
-                    fix = _two_body_fix(solver, stars, looked(BOTH), tilt, state, stamp_s)
-                    return Solution.of(stars, f"fix by {_named(BOTH)}", fix=fix, tilt=tilt, bodies=BOTH)
+                    fix = _two_body_fix(solver, stars, looked(discs, both), tilt, state, stamp_s)
+                    return Solution.of(stars, f"fix by {_named(both)}", fix=fix, tilt=tilt, bodies=both)
             return replace(_on_circle(solver, stars, disc, seen, tilt, state, stamp_s), glow=glow)
-        place, wrong = places.at(state.utc_unix_s), []
+        wrong = []
         found: dict[tuple[str, ...], AttitudeAtPlace] = {}
-        for names in itertools.chain((BOTH,) * both, ((SUN,), (MOON,))[: 1 + disc.sharp]):
-            if BOTH not in found:
+        for names in itertools.chain((both,) * bool(both), ((SUN,), (MOON,))[: 1 + disc.sharp]):
+            if both not in found:
                 try:
-                    found[names] = _attitude(solver, stars, looked(names), tilt, state, place, stamp_s)
+                    found[names] = _attitude(solver, stars, looked(discs, names), tilt, state, place, stamp_s)
                 except PlaceError as error:
                     wrong.append(error)
         if not found:
-            raise wrong[both]
+            raise wrong[bool(both)]
         (names, attitude), *others = found.items()
         if others and apart:
             raise FixError(
@@ -210,15 +214,25 @@ class _Look:
 
 
 def _looks(
-    solver: Solver, stars: Stars, disc: Disc, names: tuple[str, ...], *, camera: Camera, state: EarthState
+    solver: Solver,
+    stars: Stars,
+    discs: Sequence[Disc | None],
+    names: tuple[str, ...],
+    *,
+    camera: Camera,
+    state: EarthState,
 ) -> list[_Look]:
     """The discs of a frame as these bodies; PlaceError if one is of another size."""
     found = []
-    for name, one in zip(names, (disc, disc.other), strict=False):
+    for name, one in zip(names, discs, strict=False):
         assert one is not None
         seen, body = _Seen.of(one, camera, stars.place), body_at(name, state, solver.ephemeris)
-        # where the Moon stands as it must from a glow, that is no lamp
-        _check_size(one, seen, body, camera, stars.place, alone=len(names) == 1)
+        if name in BOTH:
+            # where the Moon stands as it must from a glow, that is no lamp
+            _check_size(one, seen, body, camera, stars.place, alone=names != BOTH)
+        else:
+            # its light comes from a part of its disc
+            body = replace(body, sigma=math.hypot(body.sigma, body.radius))
         found.append(_Look(seen, body, one.sharp))
     return found
 
@@ -227,6 +241,10 @@ def _looks(
 # second disc is a ghost.
 SECOND_SIGMAS, NEAREST = 5.0, math.radians(15.0)
 PARALLAX_ROUNDS = 6
+# Planets that are seen by day.  Number of a frame's brightest points that may be one, and the chance at which one of them
+# is as far from the disc by accident: by a grid of pixels, in a band of rad on both sides.
+BY_DAY = "venus", "jupiter"
+POINTS, CHANCE, GRID, BAND = 3, 5e-3, 60, math.radians(3.0)
 # of errors that are each body's own; all others have one cause for all
 EACH_ITS_OWN = ("disc", "ephemeris")
 
@@ -241,6 +259,105 @@ def _of_all(by: Sequence[np.ndarray], terms: Sequence[tuple[ErrorTerm, ...]]) ->
     return found
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Between:
+    """Two bodies under a level, put into the sky as well as their distance goes.
+
+    raised, there, sky (2, 3): as they are seen, without air, and where they stand; variances (2,) rad2.
+    a4 (3, 3): ITRS into the level's axes.  sigma (rad): of their distance on the frame and in the sky.
+    """
+
+    raised: np.ndarray
+    there: np.ndarray
+    sky: np.ndarray
+    variances: np.ndarray
+    a4: np.ndarray
+    sigma: float
+
+    @classmethod
+    def of(cls, looks: list[_Look], g: np.ndarray, air: Atmosphere, frame: str) -> "_Between":
+        """Fit both bodies; g (3, 3): C into the level's axes.  PlaceError for bodies too low."""
+        raised = np.array([g @ look.seen.ray for look in looks])
+        if raised[:, 2].min() < MIN_COS_ZENITH:
+            raise PlaceError(f"{frame}: by the level one of its two bodies is below {MIN_DEG:.0f} deg")
+        there = air.refraction().unbend(raised)
+        bodies, seen = [look.body for look in looks], [look.seen for look in looks]
+        variances = np.array(
+            [np.sum(s.own**2) / 2 + np.sum(s.lens**2) + b.sigma**2 for s, b in zip(seen, bodies, strict=True)]
+        )
+        sky = np.array([b.itrs for b in bodies])
+        a4 = rotation.best_rotation(sky, there, 1 / variances)
+        # the Moon's parallax follows the zenith, of which it is a sixtieth
+        for _ in range(PARALLAX_ROUNDS):
+            sky = np.array([b.from_place(a4[2]) for b in bodies])
+            a4 = rotation.best_rotation(sky, there, 1 / variances)
+        # each direction's errors along the line to the other; the lens's have one cause
+        along = np.array([s.ray for s in seen[::-1]]) / np.linalg.norm(np.cross(seen[0].ray, seen[1].ray))
+        errors = [row @ s.own for row, s in zip(along, seen, strict=True)]
+        lens = sum(row @ s.lens for row, s in zip(along, seen, strict=True))
+        sigma = np.linalg.norm(np.concatenate([*errors, lens, [b.sigma for b in bodies]]))
+        return cls(raised=raised, there=there, sky=sky, variances=variances, a4=a4, sigma=float(sigma))
+
+    @property
+    def angles(self) -> tuple[float, float]:
+        """How far they are apart on the frame and in the sky, rad."""
+        seen, true = (2 * math.asin(math.dist(*v) / 2) for v in (self.there, self.sky))
+        return seen, true
+
+    @property
+    def agree(self) -> bool:
+        """Whether these two angles are the same, to their error."""
+        return abs(self.angles[0] - self.angles[1]) < SECOND_SIGMAS * self.sigma
+
+
+def _with_planet(
+    solver: Solver,
+    stars: Stars,
+    disc: Disc,
+    looked: Callable[[Sequence[Disc | None], tuple[str, ...]], list[_Look]],
+    tilt: Tilt,
+    place: Place | None,
+    state: EarthState,
+    stamp_s: float,
+) -> tuple[tuple[str, ...], tuple[Disc, ...]]:
+    """The disc's body and a planet, with the disc and the bright point that is one; nothing where it may be none.
+
+    A point agrees by its distance from the disc, and at a known place by its altitude.  The chance that another one would
+    counts every point as every planet, by the share of the frame's pixels that are as far and as high.
+    """
+    points = [
+        Disc(x=x, y=y, covariance=covariance, radius_px=0.0, sharp=True)
+        for x, y, covariance, _ in zip(stars.x, stars.y, stars.covariance, range(POINTS), strict=False)
+    ]
+    camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
+    mounting = solver.instrument.mounting
+    level = mounting.level(tilt)
+    pixels = (np.arange(GRID) + 0.5) / GRID
+    x, y = (part.ravel() for part in np.meshgrid(pixels * stars.width, pixels * stars.height))
+    rays = camera.directions(x, y)
+    found, shares = [], 0.0
+    for names, point in itertools.product(itertools.product(BOTH, BY_DAY), points):
+        with suppress(PlaceError, FixError):
+            looks = looked((disc, point), names)
+            pair = _Between.of(looks, level.camera, solver.atmosphere, stars.place)
+            seen, true = pair.angles
+            near = np.abs(np.arccos(np.clip(rays @ looks[0].seen.ray, -1, 1)) - true) < BAND
+            off, sigma = np.array([seen - true]), np.array([pair.sigma])
+            if place is not None:
+                sighted = _Sighted.of(solver, stars, looks[1], level.camera, place, state, stamp_s)
+                of_level = tilt_terms(sighted.turn[1:], level, tilt, mounting, state.utc_unix_s)
+                variance = total_covariance(sighted.terms)[1, 1] + total_covariance(of_level)[0, 0]
+                altitude = math.asin(sighted.bent[2])
+                off = np.append(off, math.asin(pair.raised[1, 2]) - altitude)
+                sigma = np.append(sigma, variance**0.5)
+                near &= np.abs(np.arcsin(rays @ level.camera[2]) - altitude) < BAND
+            shares += float(np.mean(near))
+            if (np.abs(off) < SECOND_SIGMAS * sigma).all():
+                found.append((float(np.prod(np.maximum(np.abs(off), sigma) / BAND)), names, point))
+    sound = [(names, (disc, point)) for part, names, point in found if part * shares < CHANCE]
+    return sound[0] if len(sound) == 1 else ((), (disc,))
+
+
 def _two_body_fix(
     solver: Solver, stars: Stars, looks: list[_Look], tilt: Tilt, state: EarthState, stamp_s: float
 ) -> Fix:
@@ -250,33 +367,19 @@ def _two_body_fix(
     mounting, air = about.mounting, about.atmosphere
     level = mounting.level(tilt)
     g = level.camera
-    raised = np.array([g @ look.seen.ray for look in looks])
-    if raised[:, 2].min() < MIN_COS_ZENITH:
+    pair = _Between.of(looks, g, air, stars.place)
+    raised, there, variances, a4 = pair.raised, pair.there, pair.variances, pair.a4
+    off = there - pair.sky @ a4.T
+    if not pair.agree:
+        seen_deg, true_deg = np.degrees(pair.angles)
+        names = _named(tuple(k.body.name for k in looks))
         raise PlaceError(
-            f"{stars.place}: by the level one of its two bright discs is below {MIN_DEG:.0f} deg"
+            f"{stars.place}: its two bright discs are {seen_deg:.2f} deg apart, and {names} {true_deg:.2f}"
         )
-    there = air.refraction().unbend(raised)
-    variances = np.array(
-        [np.sum(s.own**2) / 2 + np.sum(s.lens**2) + b.sigma**2 for s, b in ((k.seen, k.body) for k in looks)]
-    )
-    zenith, a4 = None, np.eye(3)
-    # the Moon's parallax follows the zenith, of which it is a sixtieth
-    for _ in range(PARALLAX_ROUNDS):
-        sky = np.array([k.body.itrs if zenith is None else k.body.from_place(zenith) for k in looks])
-        a4 = rotation.best_rotation(sky, there, 1 / variances)
-        zenith = a4[2]
     across = [_across(v) for v in there]
     turned = [np.cross(v, c) for v, c in zip(there, across, strict=True)]
     spread = np.linalg.inv(sum(t.T @ t / v for t, v in zip(turned, variances, strict=True)))
     by = [spread @ t.T / v for t, v in zip(turned, variances, strict=True)]
-    off = there - sky @ a4.T
-    sigmas = math.sqrt(float(np.sum(off**2 / variances[:, None])))
-    if sigmas > SECOND_SIGMAS:
-        apart = [math.degrees(2 * math.asin(np.linalg.norm(v[0] - v[1]) / 2)) for v in (there, sky)]
-        names = _named(tuple(k.body.name for k in looks))
-        raise PlaceError(
-            f"{stars.place}: its two bright discs are {apart[0]:.2f} deg apart, and {names} {apart[1]:.2f}"
-        )
     place = local_north(a4)
     link_to_enu = place.local_to_enu @ g @ mounting.link_to_camera
     of_sky, of_level = sky_rows(place), level_rows(place, link_to_enu)
@@ -401,9 +504,9 @@ def _attitude(
 ) -> AttitudeAtPlace:
     """The attitude by directions of bodies and the level, each in two components; PlaceError if they contradict."""
     a4, air, mounting = place.plumb_axes, solver.atmosphere, solver.instrument.mounting
-    clock_s, level, moved = solver.clock_stddev_s(stars), mounting.level(tilt), zenith_moved(place.plumb[0])
+    level, moved = mounting.level(tilt), zenith_moved(place.plumb[0])
     first = looks[0]
-    bent, raised, true = _seen_from(first.body, air, a4, stars.place)
+    bent = _seen_from(first.body, air, a4, stars.place)[0]
     local = level.camera @ first.seen.ray
     if min(math.hypot(*bent[:2]), math.hypot(*local[:2])) < MIN_SINE:
         raise FixError(
@@ -418,15 +521,8 @@ def _attitude(
     of_bodies: list[tuple[ErrorTerm, ...]] = []
     off_px = []
     for look in looks:
-        bent, raised, true = _seen_from(look.body, air, a4, stars.place)
-        components = _across(bent)
-        turn = np.cross(bent, components)
-        of_body = (
-            *look.terms(components @ g, np.array([0.0, raised])),
-            *sky_terms(turn, state, clock_s, stamp_s, a4),
-            ErrorTerm("place", turn @ moved @ place.zenith_root, shared=ALWAYS),
-            ErrorTerm("deflection", turn @ moved * place.plumb_stddev, shared=ALWAYS),
-        )
+        sighted = _Sighted.of(solver, stars, look, g, place, state, stamp_s)
+        bent, components, turn, of_body = sighted.bent, sighted.components, sighted.turn, sighted.terms
         whole = total_covariance(of_body)
         off = components @ (bent - found @ look.seen.ray)
         # what is known already has no azimuth until there is a body
@@ -454,13 +550,54 @@ def _attitude(
     ellipsoid = plumb + moved * (place.ellipsoid_stddev - place.plumb_stddev)
     own = total_covariance(t for t in terms if not t.common)
     return AttitudeAtPlace(
-        **_fields(stars, state, tilt, clock_s, a4, found, own) | {"residual_px": np.array(off_px)},
+        **_fields(stars, state, tilt, solver.clock_stddev_s(stars), a4, found, own)
+        | {"residual_px": np.array(off_px)},
         residual_arcsec=math.dist(expected, looks[-1].seen.ray) / ARCSEC,
         zenith_distance=math.acos(min(max(bent[2], -1.0), 1.0)),
-        refraction_arcsec=math.dist(bent, true) / ARCSEC,
+        refraction_arcsec=math.dist(bent, sighted.true) / ARCSEC,
         place=place,
         **attitudes_at(place, found, mounting, terms, (plumb, ellipsoid)),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Sighted:
+    """A body over a known place, bent (3,) as it is seen and true (3,) without air, along east, north and up.
+
+    components (2, 3): across it, sideways and upwards; turn (2, 3): their change by a small rotation.
+    terms: errors of them.
+    """
+
+    bent: np.ndarray
+    true: np.ndarray
+    components: np.ndarray
+    turn: np.ndarray
+    terms: tuple[ErrorTerm, ...]
+
+    @classmethod
+    def of(
+        cls,
+        solver: Solver,
+        stars: Stars,
+        look: _Look,
+        g: np.ndarray,
+        place: Place,
+        state: EarthState,
+        stamp_s: float,
+    ) -> "_Sighted":
+        """Return the body over its place; g (3, 3): C into axes whose third is up."""
+        a4, moved = place.plumb_axes, zenith_moved(place.plumb[0])
+        bent, raised, true = _seen_from(look.body, solver.atmosphere, a4, stars.place)
+        components, local = _across(bent), g @ look.seen.ray
+        g = rotation.about_axis(2, math.atan2(bent[1], bent[0]) - math.atan2(local[1], local[0])) @ g
+        turn = np.cross(bent, components)
+        terms = (
+            *look.terms(components @ g, np.array([0.0, raised])),
+            *sky_terms(turn, state, solver.clock_stddev_s(stars), stamp_s, a4),
+            ErrorTerm("place", turn @ moved @ place.zenith_root, shared=ALWAYS),
+            ErrorTerm("deflection", turn @ moved * place.plumb_stddev, shared=ALWAYS),
+        )
+        return cls(bent, true, components, turn, terms)
 
 
 def _seen_from(

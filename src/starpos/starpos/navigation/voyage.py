@@ -18,7 +18,9 @@ from starpos.navigation.equations import (
     BY_LAW,
     CONSTANTS,
     MEASURED,
+    MOUNT,
     PLACE,
+    TURN,
     Links,
     Motion,
     Odometry,
@@ -48,10 +50,12 @@ from starpos.navigation.sightings import FrameUnderWay, SunFrame
 from starpos.navigation.start import first_motion, nodes_of
 from starpos.navigation.vessel import MotionLaw, Vessel
 from starpos.progress import Progress, quiet
+from starpos.rotation import normalised
+from starpos.units import ARCSEC
 
 MIN_FRAMES = 3
-# the place has settled where a step is below it, in m and as a share of its sigma
-SETTLED_M, SETTLED_SHARE = 1.0, 0.02
+# place and attitude have settled where a step is below it, in m, in rad and as a share of its sigma
+SETTLED_M, SETTLED_RAD, SETTLED_SHARE = 1.0, 10 * ARCSEC, 0.02
 # equations of a place farther off are wrong by more than the stars' errors: the square of the angle
 NEAR_M = 2000.0
 # minimum ratio of found to stated variances that is reported
@@ -68,6 +72,13 @@ ZENITH_MOVED = 1e-3
 STANDING_SIGMA, TRIAL_SIGMA = 2e-3, 5e-3
 # of a chi-squared of three degrees of freedom: the median, and what one in a million exceeds
 MEDIAN_OF_CHI2, OUTLIER_CHI2 = 2.366, 30.7
+# A disc is the Sun if a lamp, which stands still, is farther away than this in sigma, and the Sun nearer: chi-squared of
+# three degrees of freedom that one in a thousand exceeds
+LAMP_SIGMAS, SUN_CHI2 = 5.0, 16.3
+# with a wrong heading places or velocities scatter by more than this factor, in variances
+MISFIT = 1.5
+# 1 sigma of a further constant of which nothing is known
+UNKNOWN = 100.0
 # steps of the accelerometer's noise, how many at most, and when to stop: a factor of e^8; of e^3 by a law, since much
 # more noise would take the law's errors too, and be likely again
 FACTOR, MAX_FACTORS, UNLIKELY, UNLIKELY_BY_LAW = 2**0.5, 16, 8.0, 3.0
@@ -172,12 +183,14 @@ class Adjustment:
             sigma = float(np.sqrt(variance.min()))
             progress("adjusting", min(0.95, (k + 1) / 8))
             settled = near and not seen_anew and step < max(SETTLED_M, SETTLED_SHARE * sigma)
+            # a known place settles long before the heading
+            turned = np.linalg.norm(solution.nodes[:, TURN], axis=1)
+            variance = np.trace(solution.covariance[:, TURN, TURN], axis1=1, axis2=2)
+            settled = settled and bool(
+                (turned < np.maximum(SETTLED_RAD, SETTLED_SHARE * variance**0.5)).all()
+            )
             if settled and not self._revised(motion, chain, links, stars):
-                if self._suns and self.excess["frames"] > NOTABLE:
-                    raise VoyageError(
-                        "the bright disc does not move as the Sun by gravity and gyro: it is a lamp, or the clock or the "
-                        "place is wrong"
-                    )
+                self._check_sun(motion, chain, stars)
                 progress("adjusting", 1.0)
                 return motion, solution, k + 1
         raise FixError(
@@ -211,12 +224,61 @@ class Adjustment:
     def _suns(self) -> list[SunFrame]:
         return [frame for frame in self.frames if isinstance(frame, SunFrame)]
 
+    def _check_sun(self, motion: Motion, chain: Chain, stars: StarAttitudes) -> None:
+        """Raise VoyageError unless the disc moves as the Sun and not as a lamp, which stands still.
+
+        Three constants are fitted.  The first is the share of the Sun's way in the sky that the disc stays behind: 0 for
+        the Sun, 1 for what is fixed to the ground.  The others are its height above the Sun and its azimuth, which the
+        vehicle's own way shows.  Stars in the window make that unnecessary.
+        """
+        lone = ~stars.whole
+        if not lone.any():
+            return
+        contradicted, undecided = self.excess["frames"] > NOTABLE, False
+        if lone.all():
+            suns = np.einsum("kij,kj->ki", stars.camera_to_itrs, stars.rays)
+            still = np.cross(suns, suns[len(suns) // 2])
+            up = zenith_at(motion.place[stars.index])
+            turns = np.stack([still, normalised(np.cross(suns, up)), up], -1)
+            found, covariance = self._fitted(motion, chain, stars, turns)
+            contradicted |= max(self.excess["places"], self.excess["velocities"]) > MISFIT
+            contradicted |= bool(found @ np.linalg.solve(covariance, found) > SUN_CHI2)
+            undecided = bool(1 - found[0] < LAMP_SIGMAS * covariance[0, 0] ** 0.5)
+        if contradicted:
+            raise VoyageError(
+                "the bright disc does not move as the Sun by gravity, gyro and the places: it is a lamp, or the clock or "
+                "a place is wrong"
+            )
+        if undecided:
+            raise VoyageError(
+                "the bright disc may be a lamp as high as the Sun: that it moves as the Sun does shows only later"
+            )
+
     def _revised(self, motion: Motion, chain: Chain, links: Links, stars: StarAttitudes) -> bool:
         """Whether the motion, settled, changes what is believed of noise, law or standstills."""
         weighed = self._weighed(motion, chain, links)
         # standstills are judged by the law alone at first, and again by what is known in the end
         judged = self.standing is not None and weighed
         return weighed if judged else self._stopped(motion, chain, stars) or weighed
+
+    def _fitted(
+        self, motion: Motion, chain: Chain, stars: StarAttitudes, turns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Further constants (T,) and their covariance (T, T); turns (F, 3, T): of frames by each, about ITRS's axes."""
+        n, more = chain.unknowns, turns.shape[2]
+        camera = (motion.attitude[stars.index] @ motion.camera_to_body).transpose(0, 2, 1)
+
+        def widened(rows: np.ndarray) -> np.ndarray:
+            return np.insert(rows, [rows.shape[-1] - 1] * more, 0.0, axis=-1)
+
+        first, nodes, links = widened(chain.first), widened(chain.nodes), widened(chain.links)
+        free = np.zeros((more, first.shape[1]))
+        free[:, -1 - more : -1] = np.eye(more) / UNKNOWN
+        first = np.vstack([first, free])
+        # the mount's columns are the whitening itself
+        nodes[stars.index, :3, -1 - more : -1] = -nodes[stars.index, :3, n:][..., MOUNT] @ camera @ turns
+        solution = smoothed(Chain(first=first, nodes=nodes, links=links, constants=chain.constants + more))
+        return solution.constants[-more:], solution.covariance[-1, -more:, -more:]
 
     def _stopped(self, motion: Motion, chain: Chain, stars: StarAttitudes) -> bool:
         """Whether it is believed to stand elsewhere than before: where it seems to, and the rest bears that out."""

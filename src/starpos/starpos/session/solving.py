@@ -104,7 +104,9 @@ def attitude_beside(
     """
     disc = question.stars.disc
     if disc is not None and answer.found is None and (disc.sharp or answer.ok):
-        return sun_alone(solver, question.stars, disc, frame_id) if answer.bodies in ((), (SUN,)) else None
+        return (
+            sun_alone(solver, question.stars, disc, frame_id) if answer.bodies[:1] in ((), (SUN,)) else None
+        )
     if answer.found is None and answer.status in searching.UNASKED:
         answer = searching.identify_every_way(solver, replace(question, tilts=None, places=None)).solution
     attitude = camera_attitude_of(solver, question.stars, answer, frame_id)
