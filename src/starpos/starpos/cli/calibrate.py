@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos import rotation
-from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rms, seen_by
+from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, hour_by_lens, rms, seen_by
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
 from starpos.cli import console, inputs, options, overwriting, places_file, watch_output
@@ -102,6 +102,13 @@ def run_site(
     if tilts is None:
         sag = SAG_ARCSEC_PER_SQRT_HOUR if args.sag is None else args.sag
         found = calibrate_fixed(solver, frames, site, sag, bar, known)
+        by_files = replace(solver, hour_by_lens=hour_by_lens)
+        for n, seen in list(known.items())[:1]:
+            stars = frames[n]
+            if isinstance(stars, Stars) and not by_files.attitude_at(stars, seen, site).hour_shown:
+                console.complain(
+                    f"{stars.place}: nothing shows that its hour is right: the vertical holds if the times are UTC"
+                )
     elif instrument.vertical is not None:
         raise InstrumentError(
             f"{args.instrument} describes a camera fixed to the ground: give --fixed, or another instrument "

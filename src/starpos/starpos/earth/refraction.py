@@ -11,6 +11,7 @@ from functools import cached_property
 import erfa
 import numpy as np
 
+from starpos.earth._air import Air
 from starpos.errors import InstrumentError
 
 STANDARD_PRESSURE_PA = 101_325.0
@@ -145,28 +146,15 @@ class Refraction:
     a: float
     b: float
 
+    @cached_property
+    def compiled(self) -> Air:
+        """The model, for compiled code."""
+        return Air(self.a, self.b, MIN_COS_ZENITH)
+
     def bend(self, v: np.ndarray) -> np.ndarray:
         """Raise unrefracted directions v (..., 3) in L to the observed ones (ERFA's eraAtioq, one Newton step)."""
-        flat, up = _flat(v), np.maximum(v[..., 2], MIN_COS_ZENITH)
-        tan = flat / up
-        w = self.b * tan * tan
-        return _raised(v, flat, (self.a + w) * tan / (1 + (self.a + 3 * w) / (up * up)))
+        return self.compiled.bent(v)
 
     def unbend(self, u: np.ndarray) -> np.ndarray:
         """Lower observed directions u (..., 3) in L to the unrefracted ones."""
-        flat = _flat(u)
-        tan = flat / np.maximum(u[..., 2], MIN_COS_ZENITH)
-        return _raised(u, flat, -(self.a + self.b * tan * tan) * tan)
-
-
-def _flat(v: np.ndarray) -> np.ndarray:
-    """Horizontal lengths (...) of directions v (..., 3)."""
-    return np.maximum(np.hypot(v[..., 0], v[..., 1]), 1e-12)
-
-
-def _raised(v: np.ndarray, flat: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Directions v (..., 3), of horizontal lengths `flat`, turned by angles toward +Z within their vertical planes."""
-    c, s = np.cos(angle), np.sin(angle)
-    out = v * (c - s * v[..., 2] / flat)[..., None]
-    out[..., 2] = c * v[..., 2] + s * flat
-    return out
+        return self.compiled.unbent(u)

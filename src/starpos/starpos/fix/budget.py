@@ -11,6 +11,7 @@ from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.earth.refraction import Atmosphere
+from starpos.fix._adjustment import gain_of, spread
 from starpos.fix.attitude import ENU, LINK, Attitude, heading_row
 from starpos.fix.terms import ALWAYS, EACH_POSE, ErrorTerm, Origin, total_covariance
 from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
@@ -113,26 +114,6 @@ def mount_term(name: str, link_to_enu: np.ndarray, stddev: float) -> tuple[Error
     return (ErrorTerm(name, factor, shared=ALWAYS),)
 
 
-def inverses(covariance: np.ndarray) -> np.ndarray:
-    """Inverses of symmetric matrices (N, 2, 2); written out, because LAPACK takes ten times as long."""
-    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    return np.stack([c, -b, -b, a], -1).reshape(-1, 2, 2) / (a * c - b * b)[:, None, None]
-
-
-def gain_of(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Change (4, N, 2) of the parameters of a weighted fit for an error of one pixel of each star.
-
-    slope (N, 2, 4): derivatives by the parameters.  covariance (N, 2, 2) px2.  NaN if they cannot be separated.
-    """
-    weighted = (inverses(covariance) @ slope).reshape(-1, 4)
-    try:
-        root = np.linalg.cholesky(slope.reshape(-1, 4).T @ weighted)
-    except np.linalg.LinAlgError:
-        return np.full((4, len(slope), 2), np.nan)
-    half = np.linalg.inv(root)
-    return (half.T @ half @ weighted.T).reshape(4, -1, 2)
-
-
 @at_once
 @dataclass(frozen=True)
 class StarErrors:
@@ -156,7 +137,8 @@ class StarErrors:
 
         slope (N, 2, 4): derivatives in px of the parameters, of which the first three rotate A4.
         """
-        return cls(gain_of(slope, centroids + catalogue)[:3], centroids, catalogue, same_stars)
+        whole = np.ascontiguousarray(centroids + catalogue)
+        return cls(gain_of(np.ascontiguousarray(slope), whole), centroids, catalogue, same_stars)
 
     def rotated(self, errors_px: np.ndarray) -> np.ndarray:
         """Rotation (3, ...) of A4 in rad that errors (N, 2, ...) of the predicted places in px make."""
@@ -166,8 +148,7 @@ class StarErrors:
 
     def rotation_covariance(self, covariance: np.ndarray) -> np.ndarray:
         """Covariance (3, 3) in rad2 of A4's rotation, from the covariances (N, 2, 2) in px2 of independent stars."""
-        moved = np.einsum("ika,kab->ikb", self.gain, covariance)
-        return moved.reshape(3, -1) @ self.gain.reshape(3, -1).T
+        return spread(self.gain, np.ascontiguousarray(covariance))
 
 
 def tilt_terms(

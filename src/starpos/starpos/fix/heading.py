@@ -19,7 +19,7 @@ from starpos.fix.attitude import CAMERA, ENU, Attitude, heading_row
 from starpos.fix.budget import Circumstances, link_attitude, mount_term, sky_terms
 from starpos.fix.checks import check_visible
 from starpos.fix.sighting import FittedSighting, fitted_fields
-from starpos.fix.star_fit import MatchedStars, StarAdjustment, StarFit, apparent, fit_stars
+from starpos.fix.star_fit import MatchedStars, StarFit, adjustment_of, apparent, fit_stars
 from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
 from starpos.frozen import at_once
 from starpos.identification import fisheye
@@ -103,8 +103,8 @@ def attitude_at_place(stars: MatchedStars, place: Place, about: Circumstances) -
     if fisheye.is_wide(camera) and atmosphere.pressure_pa:
         leaned = [rotation.from_vector(turn) for turn in np.eye(3)[:2] * STEP_RAD]
         leaning = [
-            StarAdjustment(xy=stars.xy, itrs=itrs, g=r @ g, camera=camera, refraction=refraction).predict(
-                r @ seen.fit.a4, seen.fit.scale
+            adjustment_of(stars.xy, camera, r @ g, itrs, refraction).predict(
+                r @ seen.fit.a4, seen.fit.scale, refraction.compiled
             )
             for r in leaned
         ]

@@ -4,18 +4,19 @@ scatter.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from starpos import rotation
 from starpos._numeric.roots import symmetric_root
-from starpos.earth.orientation import ROTATION_RAD_S, later, station_velocity
+from starpos.earth.ellipsoid import ECCENTRICITY2
+from starpos.earth.orientation import EQUATOR_M_PER_S, ROTATION_RAD_S, SPEED_OF_LIGHT, later
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError
-from starpos.fix.budget import Circumstances, StarErrors, gain_of
+from starpos.fix._adjustment import Adjustment
+from starpos.fix._scatter import distances2, expected_variance, sifted
+from starpos.fix.budget import Circumstances, StarErrors
 from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Stars
@@ -31,11 +32,8 @@ MIN_STARS = 3
 SETTLED, MAX_STEPS = 1e-11, 20
 # the rounds end when the scatter changes by less than this share of itself, and of this minimum, px2
 SAME_SHARE, SAME_PX2 = 0.02, 1e-6
-# small rotations, rad, about three axes, for the derivatives of places by them
-STEP_RAD = 1e-5
-SMALL_TURNS = STEP_RAD * np.array([rotation.cross_matrix(axis).T for axis in np.eye(3)])
 # an air that bends nothing
-BENT_ALREADY = Refraction(0.0, 0.0)
+BENT_ALREADY = Refraction(0.0, 0.0).compiled
 # a covariance that is the same in all directions
 ISOTROPIC = np.eye(2)
 
@@ -63,75 +61,26 @@ class Fitted:
         return slice(None) if self.keep.all() else self.keep
 
 
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class StarAdjustment:
-    """Stars that a camera sees, and where an estimate of its attitude has them.
+def adjustment_of(
+    xy: np.ndarray, camera: Camera, g: np.ndarray, itrs: np.ndarray, refraction: Refraction
+) -> Adjustment:
+    """The problem of N stars, seen at xy (N, 2) px, in the geocentric apparent directions itrs (N, 3).
 
-    xy (N, 2): px, where they are seen.  itrs (N, 3): their directions, along the axes which A4 takes into L.
-    g (3, 3): C into L.  refraction: of the air, about L's Z.
-    on_ground: whether the camera moves with the Earth: the directions are geocentric then, in ITRS.
-
-    An estimate is A4 (3, 3) and the factor on the focal length.
+    g (3, 3): A2 A3, which takes C into L.
     """
-
-    xy: np.ndarray
-    itrs: np.ndarray
-    g: np.ndarray
-    camera: Camera
-    refraction: Refraction
-    on_ground: bool = True
-
-    def predict(self, a4: np.ndarray, scale: float, refraction: Refraction | None = None) -> np.ndarray:
-        """Pixels (N, 2) where an estimate has the stars, under another air if that is given."""
-        return self._pixels(self._upward(a4), scale, refraction or self.refraction)
-
-    def jacobian(self, a4: np.ndarray, scale: float) -> np.ndarray:
-        """Derivatives (N, 2, 4) of `predict` by a small rotation of A4 about L's axes and a relative change of the scale.
-
-        Left out is how the ground's velocity depends on the place: 1.5e-6 of them.
-        """
-        v = self._upward(a4)
-        ahead, behind = (self._pixels(v + sign * v @ SMALL_TURNS, scale, self.refraction) for sign in (1, -1))
-        by_scale = self._pixels(v, scale, self.refraction) - [self.camera.cx, self.camera.cy]
-        return np.stack([*(ahead - behind) / (2 * STEP_RAD), by_scale], -1)
-
-    def refined(self, a4: np.ndarray, scale: float, gain: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-        """The best estimate near one, by Gauss-Newton with the gain (4, N, 2) of the stars' places.
-
-        Returns also the residuals (N, 2), predicted minus seen px, before the last step; FixError if none is the last.
-        """
-        for _ in range(MAX_STEPS):
-            residual = self.predict(a4, scale) - self.xy
-            step = -gain.reshape(4, -1) @ residual.ravel()
-            if not np.isfinite(step).all():
-                break
-            a4, scale = rotation.from_vector(step[:3]) @ a4, scale * (1 + step[3])
-            if np.abs(step).max() < SETTLED:
-                return a4, scale, residual
-        raise FixError("the identified stars do not fit into the camera's field: check focal length and tilt")
-
-    def _upward(self, a4: np.ndarray) -> np.ndarray:
-        """Unrefracted directions (N, 3) in L."""
-        seen = self.itrs
-        if self.on_ground:
-            seen = rotation.normalised(seen + station_velocity(a4[2]))
-        return seen @ a4.T
-
-    def _pixels(self, v: np.ndarray, scale: float, refraction: Refraction) -> np.ndarray:
-        """Pixels (..., 2) of unrefracted directions v (..., 3) in L."""
-        c = self.camera
-        return c.lens.places(refraction.bend(v) @ self.g) * [scale * c.fx, scale * c.fy] + [c.cx, c.cy]
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    ground = EQUATOR_M_PER_S / SPEED_OF_LIGHT, ECCENTRICITY2
+    return Adjustment(xy, itrs, g, camera.lens, intrinsics, refraction.compiled, *ground)
 
 
-def fitted(problem: StarAdjustment, local: np.ndarray, stated: np.ndarray) -> Fitted:
+def fitted(problem: Adjustment, local: np.ndarray, stated: np.ndarray) -> Fitted:
     """The fit of the stars, from a closed solution by Gauss-Newton over the rotation A4 and the plate scale.
 
     The derivatives are computed once: they hardly change over the remaining arcseconds.
     local (N, 3): unrefracted directions in L by the given focal length.  stated (N, 2, 2): covariances of places, px2.
     Raises FixError if the stars are too few or do not agree.
     """
-    a4, scale, settled = rotation.best_rotation(problem.itrs, local), 1.0, False
+    a4, scale, settled = problem.closed_form(local), 1.0, False
     slope = problem.jacobian(a4, scale)
     keep, jitter2 = np.ones(len(local), bool), 0.0
     for _ in range(MAX_ROUNDS):
@@ -139,8 +88,14 @@ def fitted(problem: StarAdjustment, local: np.ndarray, stated: np.ndarray) -> Fi
             raise FixError(
                 f"only {np.count_nonzero(keep)} of {len(keep)} identified stars agree on one attitude: no fix from them"
             )
-        gain = gain_of(slope * keep[:, None, None], stated + ISOTROPIC * jitter2)
-        a4, scale, residual = problem.refined(a4, scale, gain)
+        covariance = np.ascontiguousarray(stated + ISOTROPIC * jitter2)
+        a4, scale, residual = problem.refine(
+            a4, scale, slope, covariance, keep.view(np.uint8), SETTLED, MAX_STEPS
+        )
+        if residual is None:
+            raise FixError(
+                "the identified stars do not fit into the camera's field: check focal length and tilt"
+            )
         if settled:
             break
         before = keep, jitter2
@@ -158,10 +113,10 @@ def share_free(keep: np.ndarray) -> float:
 
 OUTLIER_SIGMA = 5.0
 # the grid of variances that `expected_extra` integrates over: minimum in units of the stated variance, maximum in units
-# of the sum of the squared residuals, number of points
-GRID_LEAST, GRID_MOST, GRID_POINTS = 1e-3, 1e2, 128
-# the search of the extra variance: minimum as a share of the maximum, relative precision, and steps
-MIN_EXTRA, GOOD_EXTRA, MAX_SEARCHED = 1e-12, 2e-4, 100
+# of the sum of the squared residuals
+GRID_LEAST, GRID_MOST = 1e-3, 1e2
+# the search of the extra variance: minimum as a share of the maximum, and relative precision
+MIN_EXTRA, GOOD_EXTRA = 1e-12, 2e-4
 
 
 def judged(
@@ -172,47 +127,16 @@ def judged(
     The scatter is an isotropic variance in px2, of the residuals in the mask `keep` (N,).  share: the part of the 2 N
     coordinates that the parameters of the fit leave free.
     """
-    keep = np.asarray(keep, bool)
-    kept, stated = residual[keep], covariance[keep]
-
-    def by_mean(extra: float) -> float:
-        return float(distance2(kept, stated, extra).mean()) / 2
-
-    def by_median(extra: float) -> float:
-        return median(distance2(kept, stated, extra)) / MEDIAN_OF_CHI2
-
-    if not len(kept):
-        return 0.0, keep
-    most = 8 * float(np.vdot(kept, kept))
-    # the gate goes by the median: by the mean an outlier among a dozen stars would widen it enough to pass
-    typical = _extra_at(by_median, share, most)
-    return _extra_at(by_mean, share, most), distance2(residual, covariance, typical) < OUTLIER_SIGMA**2
-
-
-def median(values: np.ndarray) -> float:
-    """The median (numpy's takes longer to be called than all else here)."""
-    n, ordered = len(values), np.sort(values)
-    return float(ordered[(n - 1) // 2] + ordered[n // 2]) / 2
-
-
-def _extra_at(size: Callable[[float], float], share: float, most: float) -> float:
-    """The extra variance, at most `most`, at which the size of squared residuals is `share`; 0 if it never is larger."""
-    if size(0.0) <= share:
-        return 0.0
-    # the logarithm of the size falls with the variance's: not at all at first, at last as fast
-    here, falls = math.log(most), 1.0
-    low, high, before = here + math.log(MIN_EXTRA), here, math.log(size(most) / share)
-    for _ in range(MAX_SEARCHED):
-        there = here + before / falls
-        if not low < there < high:
-            there = (low + high) / 2
-        above = math.log(size(math.exp(there)) / share)
-        low, high = (there, high) if above > 0 else (low, there)
-        if abs(there - here) < GOOD_EXTRA or high - low < GOOD_EXTRA:
-            break
-        falls = min(max((before - above) / (there - here), 1e-3), 1.0)
-        here, before = there, above
-    return math.exp(there)
+    return sifted(
+        np.ascontiguousarray(residual, float),
+        np.ascontiguousarray(covariance, float),
+        np.ascontiguousarray(keep, bool).view(np.uint8),
+        share,
+        MEDIAN_OF_CHI2,
+        OUTLIER_SIGMA**2,
+        MIN_EXTRA,
+        GOOD_EXTRA,
+    )
 
 
 def expected_extra(residual: np.ndarray, covariance: np.ndarray, share: float) -> float:
@@ -222,28 +146,17 @@ def expected_extra(residual: np.ndarray, covariance: np.ndarray, share: float) -
     stars follow Student's t.  This is the mean of the posterior under Jeffreys' prior of the whole variance; for errors
     that are all alike it is the mean of the inverse gamma distribution.  For many stars it is the value of `judged`.
     """
-    stated = median(covariance[:, 0, 0] + covariance[:, 1, 1]) / 2
+    residual, covariance = np.ascontiguousarray(residual, float), np.ascontiguousarray(covariance, float)
+    # the median; numpy's own takes longer than everything else here
+    traces = np.sort(covariance[:, 0, 0] + covariance[:, 1, 1])
+    stated = float(traces[(len(traces) - 1) // 2] + traces[len(traces) // 2]) / 4
     most = GRID_MOST * max(stated, float(np.vdot(residual, residual)))
-    extra = np.geomspace(GRID_LEAST * stated, most, GRID_POINTS)
-    d2, determinant = _distances(residual, covariance, extra[:, None])
-    log_density = -0.5 * (d2 + share * np.log(determinant)).sum(1) + np.log(extra / (stated + extra))
-    density = np.exp(log_density - log_density.max())
-    return float(density @ extra / density.sum())
+    return expected_variance(residual, covariance, share, stated, GRID_LEAST * stated, most)
 
 
 def distance2(residual: np.ndarray, covariance: np.ndarray, extra: float = 0.0) -> np.ndarray:
     """Squared residuals (N,) in units of their covariance plus an extra isotropic variance (px2)."""
-    return _distances(residual, covariance, extra)[0]
-
-
-def _distances(
-    residual: np.ndarray, covariance: np.ndarray, extra: float | np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Squared residuals as `distance2` has them, and the determinants of their covariances."""
-    x, y = residual.T
-    xx, xy, yy = covariance[:, 0, 0] + extra, covariance[:, 0, 1], covariance[:, 1, 1] + extra
-    determinant = xx * yy - xy * xy
-    return (yy * (x * x) - 2 * (xy * x * y) + xx * (y * y)) / determinant, determinant
+    return distances2(np.ascontiguousarray(residual, float), np.ascontiguousarray(covariance, float), extra)
 
 
 # maximum scatter as a share of the frame's diagonal; stars that scatter more were misidentified
@@ -313,7 +226,7 @@ class StarFit:
     residual (M, 2): fitted places minus seen places, px.
     """
 
-    problem: StarAdjustment
+    problem: Adjustment
     fit: Fitted
     errors: StarErrors
     residual: np.ndarray
@@ -367,7 +280,7 @@ class StarFit:
 
     def _bent(self, atmosphere: Atmosphere) -> np.ndarray:
         """Move (M, 2) of the stars, px, by STEP_REFRACTION of their refraction more."""
-        fit, stronger = self.fit, atmosphere.refraction(1 + STEP_REFRACTION)
+        fit, stronger = self.fit, atmosphere.refraction(1 + STEP_REFRACTION).compiled
         moved = self.problem.predict(fit.a4, fit.scale, stronger) - self.problem.xy - fit.residual
         return moved[fit.kept]
 
@@ -389,7 +302,7 @@ def fit_stars(
 
     Raises FixError if the stars are too few or do not agree.
     """
-    problem = StarAdjustment(xy=stars.xy, itrs=itrs, g=g, camera=camera, refraction=refraction)
+    problem = adjustment_of(stars.xy, camera, g, itrs, refraction)
     catalogue_px2 = ISOTROPIC * ((stars.place_sigma * camera.fx) ** 2)[:, None, None]
     stated = stars.covariance_px2 + catalogue_px2
     fit = fitted(problem, refraction.unbend(camera.directions(*stars.xy.T) @ g.T), stated)
@@ -401,14 +314,13 @@ def fit_stars(
     return _with_errors(problem, fit, stars.covariance_px2, catalogue_px2, stars.index)
 
 
-def seen_problem(xy: np.ndarray, camera: Camera, seen: np.ndarray) -> StarAdjustment:
+def seen_problem(xy: np.ndarray, camera: Camera, seen: np.ndarray) -> Adjustment:
     """The problem of N stars at xy (N, 2) px whose light comes from the directions seen (N, 3) along any axes.
 
     Nothing bends it on its way: A4 takes these axes into C.
     """
-    return StarAdjustment(
-        xy=xy, itrs=seen, g=np.eye(3), camera=camera, refraction=BENT_ALREADY, on_ground=False
-    )
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    return Adjustment(xy, seen, np.eye(3), camera.lens, intrinsics, BENT_ALREADY, 0.0, ECCENTRICITY2)
 
 
 def fit_seen(xy: np.ndarray, stated: np.ndarray, camera: Camera, seen: np.ndarray) -> StarFit:
@@ -422,7 +334,7 @@ def fit_seen(xy: np.ndarray, stated: np.ndarray, camera: Camera, seen: np.ndarra
 
 
 def _with_errors(
-    problem: StarAdjustment,
+    problem: Adjustment,
     fit: Fitted,
     centroids_px2: np.ndarray,
     catalogue_px2: np.ndarray,

@@ -19,8 +19,6 @@ cdef double SETTLED = 1e-14, GOOD = 1e-12, SETTLED_RAD = 1e-15, MIN_OFF = 1e-12
 cdef class Lens:
     """A lens with coefficients d (n,) of its model."""
 
-    cdef double[8] d
-
     def __init__(self, d):
         cdef int k
         for k in range(8):
@@ -28,6 +26,9 @@ cdef class Lens:
 
     cdef void seen(self, const double *v, double *place) noexcept nogil:
         """Set place (2,) to where v (3,) is seen; NaN where it is not."""
+
+    cdef void seen_slopes(self, const double *v, double *slope) noexcept nogil:
+        """Set slope (2, 3) to the derivatives of `seen` by v."""
 
     cdef void ray(self, const double *place, double *v) noexcept nogil:
         """Set v (3,) to the unit vector that is seen at place (2,); NaN if there is none."""
@@ -70,8 +71,6 @@ cdef class PlumbBob(Lens):
     leads where the distortion cannot be inverted.
     """
 
-    cdef bint bent
-
     def __init__(self, d):
         super().__init__(d)
         self.bent = any(d)
@@ -87,6 +86,18 @@ cdef class PlumbBob(Lens):
             self.distorted(plane, place)
         else:
             place[0], place[1] = plane[0], plane[1]
+
+    cdef void seen_slopes(self, const double *v, double *slope) noexcept nogil:
+        cdef double[2] plane
+        cdef double[4] by = [1.0, 0.0, 0.0, 1.0]
+        cdef double z = v[2] if v[2] > 0 else NAN
+        cdef int i
+        plane[0], plane[1] = v[0] / z, v[1] / z
+        if self.bent:
+            self.distorted_slopes(plane, by)
+        for i in range(2):
+            slope[3 * i], slope[3 * i + 1] = by[2 * i] / z, by[2 * i + 1] / z
+            slope[3 * i + 2] = -(by[2 * i] * plane[0] + by[2 * i + 1] * plane[1]) / z
 
     cdef void ray(self, const double *place, double *v) noexcept nogil:
         cdef double[2] plane
@@ -147,9 +158,6 @@ cdef class Equidistant(Lens):
     by 2 p1 x y + p2 (theta^2 + 2 x^2) and p1 (theta^2 + 2 y^2) + 2 p2 x y, where x, y are theta along the two axes.
     """
 
-    cdef readonly double reach
-    cdef bint centred
-
     def __init__(self, d, double reach):
         super().__init__(d)
         self.reach = reach
@@ -191,6 +199,39 @@ cdef class Equidistant(Lens):
         cdef double y = theta * v[1] / off, p1 = self.d[4], p2 = self.d[5], t2 = theta * theta
         place[0] += 2 * p1 * x * y + p2 * (t2 + 2 * x * x)
         place[1] += p1 * (t2 + 2 * y * y) + 2 * p2 * x * y
+
+    cdef void seen_slopes(self, const double *v, double *slope) noexcept nogil:
+        cdef double off = fmax(hypot(v[0], v[1]), MIN_OFF), theta = atan2(off, v[2])
+        cdef double length2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+        cdef double grows = self.stretched(theta) / length2, stretch = self.distance(theta) / off
+        cdef double[2] outward
+        cdef int i, j
+        # on the axis any azimuth will do
+        outward[0] = v[0] / off if off > MIN_OFF else 1.0
+        outward[1] = v[1] / off if off > MIN_OFF else 0.0
+        if not theta < self.reach:
+            grows = NAN
+        # away from the axis the angle grows, around it the direction of the place turns
+        for i in range(2):
+            for j in range(2):
+                slope[3 * i + j] = outward[i] * outward[j] * (v[2] * grows - stretch)
+            slope[3 * i + i] += stretch
+            slope[3 * i + 2] = -outward[i] * off * grows
+        if self.centred:
+            return
+        # of x and y, and of what they move the place by
+        cdef double p1 = self.d[4], p2 = self.d[5], x = theta * outward[0], y = theta * outward[1]
+        cdef double[4] by = [2 * p1 * y + 6 * p2 * x, 2 * p1 * x + 2 * p2 * y, 2 * p1 * x + 2 * p2 * y, 6 * p1 * y + 2 * p2 * x]
+        cdef double[6] turn
+        stretch = theta / off
+        for i in range(2):
+            for j in range(2):
+                turn[3 * i + j] = outward[i] * outward[j] * (v[2] / length2 - stretch)
+            turn[3 * i + i] += stretch
+            turn[3 * i + 2] = -outward[i] * off / length2
+        for i in range(2):
+            for j in range(3):
+                slope[3 * i + j] += by[2 * i] * turn[j] + by[2 * i + 1] * turn[3 + j]
 
     cdef void ray(self, const double *place, double *v) noexcept nogil:
         cdef double[2] centred, move

@@ -176,6 +176,7 @@ class FirstNight:
             return Look(False, sight.solution.message, "wait for stars")
         try:
             tilt = log.average(mid, sight.stars.exposure_s or 0.0)
+            self._solver.instrument.inclinometer.check_live(tilt)
         except StarposError as error:
             return Look(False, str(error), "wait for tilts")
         if not _still(log, mid - AROUND_S, mid + AROUND_S):

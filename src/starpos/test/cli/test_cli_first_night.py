@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos first-night`: from nothing to a saved A3, what it says on the way, and what it refuses."""
 
+import shutil
 from itertools import pairwise
 
 import numpy as np
@@ -80,3 +81,13 @@ def test_stars_out_of_focus_and_too_few_get_no_further(first_night, tmp_path):
 def test_a_folder_that_is_not_there_is_a_sentence(first_night, tmp_path):
     (status, _, complaint), _ = first_night(tmp_path / "none")
     assert status == 2 and "there is no such folder" in complaint[0]
+
+
+def test_a_level_that_repeats_one_value_gets_no_further(first_night, whole, tmp_path):
+    folder = shutil.copytree(whole[0], tmp_path / "frozen")
+    head, first, *rest = (folder / "tilt.csv").read_text().splitlines()
+    same = first.split(",")[1:]
+    rows = [",".join([row.split(",")[0], *same]) for row in rest]
+    (folder / "tilt.csv").write_text("\n".join([head, first, *rows]) + "\n")
+    (status, said, _), out = first_night(folder)
+    assert status == 1 and "does not measure" in said and not out.exists()

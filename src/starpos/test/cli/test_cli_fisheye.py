@@ -2,6 +2,7 @@
 """A fisheye from the command line: simulated, identified, solved, calibrated, and used by its calibration."""
 
 import json
+import math
 
 import pytest
 from cli_calls import AIR, PLACE, objects, without_focal_length
@@ -148,3 +149,15 @@ def test_a_nominal_lens_claims_what_a_mask_and_an_axis_off_the_middle_do(skies, 
     assert 0 < abs(part["heading"] - whole["heading"]) < 3 * part["sigma_heading_deg"] < 0.5
     # the optical axis may be some degrees off the middle of the frame, and then the camera seems to lean
     assert whole["sigma_pitch_deg"] > 2
+
+
+def test_a_pose_by_high_stars_alone_says_that_nothing_shows_the_hour(skies, run, tmp_path):
+    path = sorted(skies.glob("stars_*.csv"))[0]
+    head, names, *rows = path.read_text().splitlines()
+    # 1400 x 1400 px
+    high = [r for r in rows if math.dist(map(float, r.split(",")[:2]), (700, 700)) < 350]
+    path = tmp_path / path.name
+    path.write_text("\n".join([head, names, *high]) + "\n")
+    site = ("--site", PLACE["latitude"], PLACE["longitude"])
+    status, _, err = run("calibrate", path, *LENS, *site, *AIR, "--fixed", "-o", tmp_path / "fixed.yaml")
+    assert status == 0 and any("hour is right" in line for line in err)

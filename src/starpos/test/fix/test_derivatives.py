@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers of a fix, against other forms: derivatives, directions, scatter, roots."""
-
-from dataclasses import replace
+"""Results of compiled code for a fix, against plain forms: derivatives, directions, scatter, roots."""
 
 import numpy as np
 import pytest
@@ -11,8 +9,17 @@ from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.orientation import station_velocity
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
-from starpos.fix.budget import StarErrors, gain_of
-from starpos.fix.star_fit import StarAdjustment, distance2, expected_extra, fitted, judged
+from starpos.fix._adjustment import gain_of, spread
+from starpos.fix._scatter import extra_variance
+from starpos.fix.star_fit import (
+    GOOD_EXTRA,
+    MIN_EXTRA,
+    adjustment_of,
+    distance2,
+    expected_extra,
+    fitted,
+    judged,
+)
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.units import MEDIAN_OF_CHI2
 
@@ -40,11 +47,7 @@ def problem_of(camera, off_zenith_rad, rng, stars=40):
     air = Atmosphere().refraction()
     a4 = rotation.from_vector(rng.normal(0, 1, 3))
     local = air.unbend(v @ g.T)
-    return (
-        StarAdjustment(xy=camera.project(v), itrs=local @ a4, g=g, camera=camera, refraction=air),
-        a4,
-        local,
-    )
+    return adjustment_of(camera.project(v), camera, g, local @ a4, air), a4, local
 
 
 def bent(v):
@@ -101,7 +104,7 @@ def test_a_fit_is_the_least_squares_solution_and_leaves_a_wrong_star_out(lens, r
     problem, _, local = problem_of(LENSES[lens], 0.3, rng)
     xy = problem.xy + rng.normal(0, 0.1, problem.xy.shape)
     xy[7] += [30.0, -20.0]
-    noisy = replace(problem, xy=xy)
+    noisy = adjustment_of(xy, LENSES[lens], problem.g, problem.itrs, Atmosphere().refraction())
     stated = np.tile(np.diag([0.01, 0.02]), (len(xy), 1, 1))
     fit = fitted(noisy, local, stated)
     assert np.flatnonzero(~fit.keep).tolist() == [7]
@@ -121,13 +124,11 @@ def test_gain_and_spread_are_those_of_a_linear_fit(rng):
     rows, weight = slope.reshape(-1, 4), np.zeros((18, 18))
     for k in range(9):
         weight[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = np.linalg.inv(covariance[k])
-    expected = np.linalg.solve(rows.T @ weight @ rows, rows.T @ weight)
+    expected = np.linalg.solve(rows.T @ weight @ rows, rows.T @ weight)[:3]
     gain = gain_of(slope, covariance)
-    np.testing.assert_allclose(gain.reshape(4, 18), expected, rtol=1e-8, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_allclose(gain.reshape(3, 18), expected, rtol=1e-8, atol=1e-12 * np.abs(expected).max())
     own = np.linalg.inv(rows.T @ weight @ rows)[:3, :3]
-    errors = StarErrors.of(slope, covariance, np.zeros_like(covariance), ())
-    found = errors.rotation_covariance(covariance)
-    np.testing.assert_allclose(found, own, rtol=1e-7, atol=1e-12 * np.abs(own).max())
+    np.testing.assert_allclose(spread(gain, covariance), own, rtol=1e-7, atol=1e-12 * np.abs(own).max())
 
 
 def test_what_stars_do_not_tell_apart_has_no_gain():
@@ -148,19 +149,32 @@ def test_a_root_is_symmetric_and_its_square_is_the_covariance(size, rng):
     assert np.isnan(symmetric_root(np.full((size, size), np.nan))).all()
 
 
+def searched(residual, covariance, share, median_of_chi2):
+    """The variance of `extra_variance`, by plain halving."""
+
+    def excess(extra):
+        d2 = distance2(residual, covariance, extra)
+        return (np.median(d2) / median_of_chi2 if median_of_chi2 else d2.mean() / 2) - share
+
+    low, high = 0.0, 8 * np.sum(residual**2)
+    if excess(0.0) <= 0:
+        return 0.0
+    for _ in range(80):
+        middle = (low + high) / 2
+        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
+    return high
+
+
+@pytest.mark.parametrize("median_of_chi2", [0.0, MEDIAN_OF_CHI2])
 @pytest.mark.parametrize("stars", [3, 4, 21, 88])
-def test_the_scatter_makes_residuals_as_large_as_their_errors(stars, rng):
+def test_scatter_is_what_halving_finds(stars, median_of_chi2, rng):
     root = rng.normal(0, 0.05, (stars, 2, 2))
-    covariance, every = root @ root.transpose(0, 2, 1) + 1e-4 * np.eye(2), np.ones(stars, bool)
+    covariance = root @ root.transpose(0, 2, 1) + 1e-4 * np.eye(2)
     for scatter in (0.01, 0.1, 3.0):
         residual = rng.normal(0, scatter, (stars, 2))
-        extra, good = judged(residual, covariance, every, 0.9)
-        left = distance2(residual, covariance, extra).mean() / 2
-        assert left == pytest.approx(0.9, rel=1e-3) if extra else left <= 0.9
-        # the gate is by the median, which a few wrong ones do not move
-        d2 = distance2(residual, covariance)
-        if np.median(d2) <= 0.9 * MEDIAN_OF_CHI2:
-            assert np.array_equal(good, d2 < 25)
+        expected = searched(residual, covariance, 0.9, median_of_chi2)
+        found = extra_variance(residual, covariance, 0.9, median_of_chi2, MIN_EXTRA, GOOD_EXTRA)
+        assert found == pytest.approx(expected, rel=1e-3)
 
 
 def test_stars_are_judged_by_those_that_are_kept(rng):
@@ -199,3 +213,40 @@ def test_the_expected_scatter_has_the_unit_of_its_errors(scale, rng):
     residual, covariance = rng.normal(0, 0.1, (30, 2)), np.tile(1e-3 * np.eye(2), (30, 1, 1))
     plain = expected_extra(residual, covariance, 0.9)
     assert expected_extra(residual * scale, covariance * scale**2, 0.9) == pytest.approx(plain * scale**2)
+
+
+def test_it_does_not_matter_how_arrays_lie_in_memory(rng):
+    residual, covariance, keep = (
+        rng.normal(0, 0.1, (30, 2)),
+        np.tile(1e-3 * np.eye(2), (30, 1, 1)),
+        np.arange(30) > 2,
+    )
+    extra, good = judged(residual, covariance, keep, 0.9)
+    other, same = judged(np.asfortranarray(residual), np.asfortranarray(covariance), keep.astype(int), 0.9)
+    assert other == extra and np.array_equal(same, good)
+    assert expected_extra(np.asfortranarray(residual), np.asfortranarray(covariance), 0.9) == expected_extra(
+        residual, covariance, 0.9
+    )
+
+
+def test_arrays_that_do_not_fit_to_each_other_are_refused(rng):
+    problem, a4, local = problem_of(LENSES["pinhole"], 0.3, rng, stars=8)
+    slope, covariance = problem.jacobian(a4, 1.0), np.tile(np.eye(2), (8, 1, 1))
+    keep = np.ones(8, np.uint8)
+    for call in (
+        lambda: adjustment_of(
+            problem.xy, LENSES["pinhole"], problem.g, problem.itrs[1:], Atmosphere().refraction()
+        ),
+        lambda: problem.closed_form(local[1:]),
+        lambda: problem.predict(np.eye(2), 1.0),
+        lambda: problem.refine(a4, 1.0, slope, covariance[1:], keep, 1e-11, 20),
+        lambda: problem.refine(a4, 1.0, slope, covariance, keep[1:], 1e-11, 20),
+        lambda: gain_of(slope, covariance[1:]),
+        lambda: spread(gain_of(slope, covariance), covariance[:1]),
+        lambda: judged(problem.xy, covariance[1:], keep, 0.9),
+        lambda: distance2(problem.xy, covariance[1:]),
+        lambda: expected_extra(problem.xy[:, :1], covariance, 0.9),
+        lambda: symmetric_root(np.ones((2, 3))),
+    ):
+        with pytest.raises(ValueError):
+            call()

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from starpos.errors import InstrumentError
+from starpos.fix.star_fit import seen_problem
 from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.rotation import from_vector
 
 # of a lens that is nearly equisolid, one that is nearly stereographic, one that ends its picture at 100 deg
 EQUISOLID, STEREOGRAPHIC, SHORT = (
@@ -141,3 +143,13 @@ def test_a_decentred_lens_is_colmaps_and_is_inverted(rng):
     np.testing.assert_allclose(camera.project(v), xy, atol=1e-9)
     np.testing.assert_allclose(camera.directions(*xy.T), v, atol=1e-12)
     np.testing.assert_allclose(pickle.loads(pickle.dumps(camera)).project(v), xy, atol=1e-9)
+
+
+def test_the_fit_of_a_decentred_lens_has_its_slopes(rng):
+    camera = fisheye((*EQUISOLID, 0.02, -0.03))
+    v = directions(rng.uniform(0.01, np.radians(80), 50), rng)
+    problem = seen_problem(camera.project(v), camera, v)
+    slope = np.asarray(problem.jacobian(np.eye(3), 1.0))
+    for k, turn in enumerate(np.eye(3) * 1e-6):
+        ahead, behind = (np.asarray(problem.predict(from_vector(s * turn), 1.0)) for s in (1, -1))
+        np.testing.assert_allclose(slope[..., k], (ahead - behind) / 2e-6, atol=1e-3)
