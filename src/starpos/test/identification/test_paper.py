@@ -7,8 +7,6 @@ import numpy as np
 import paper_triangles as paper
 import pytest
 
-from starpos.cli import main
-
 
 def test_the_papers_stars_and_triangles(catalogue):
     """The paper prints 951,181 triangles: docs/the_paper.md."""
@@ -50,17 +48,3 @@ def test_triangles_by_brute_force(side_deg, rng):
     near = paper.sides(v[:, None], v) < longest
     expected = sum(near[i, j] and near[i, k] and near[j, k] for i, j, k in combinations(range(40), 3))
     assert paper.count_triangles(v, min(longest, np.pi)) == expected
-
-
-def test_the_command_says_what_a_fields_catalogue_holds(capsys):
-    wide = ["--focal-mm", "29.67", "--pixel-um", "6.4", "--size", "1000", "700"]
-    assert main(["catalogue", "triangles", *wide]) == 0
-    out = capsys.readouterr().out
-    assert "15.00 deg across" in out
-    fewest = int(out.splitlines()[-1].split(":")[1].split()[0])
-    assert fewest >= 3
-
-
-def test_a_field_too_wide_is_a_bad_call(capsys):
-    assert main(["catalogue", "triangles", "--focal-mm", "5", "--pixel-um", "6.4"]) == 2
-    assert "check focal length" in capsys.readouterr().err
