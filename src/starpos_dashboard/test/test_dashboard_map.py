@@ -3,6 +3,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import said
 from browser import ELLIPSES, metres_per_px
@@ -13,8 +14,14 @@ def middle(box) -> tuple[float, float]:
 
 
 def test_the_ellipses_have_their_size_place_and_lean_at_the_scale_of_the_map(page):
-    page.until(lambda: min(page.run(ELLIPSES)[name][2] for name in ("newest", "average")) > 10)
+    def redrawn():
+        """Both ellipses at the map's scale: each is drawn anew by itself."""
+        seen = page.run(ELLIPSES)
+        sizes = np.array([seen[name][2] for name in ("newest", "average")]) * metres_per_px(seen)
+        return sizes == pytest.approx((600, 160), rel=0.01)
+
     for _ in range(3):
+        page.until(redrawn)
         seen = page.run(ELLIPSES)
         per_px = metres_per_px(seen)
         assert seen["newest"][2:] == pytest.approx((600 / per_px, 200 / per_px), rel=0.01, abs=0.5)
