@@ -90,7 +90,7 @@ def write_page(path: Path, nights: Sequence[Kept]) -> None:
         for r in rows
     ]
     about = (
-        f"{len(rows)} nights. Bars: how far each pose is from the mean of those before, up to {most:.0f} arcsec; red "
+        f"Nights: {len(rows)}. Bars: how far each pose is from the mean of those before, up to {most:.0f} arcsec; red "
         "where it has moved."
     )
     parts = (
