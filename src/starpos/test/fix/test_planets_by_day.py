@@ -11,42 +11,23 @@ from astropy import units as u
 from astropy.coordinates import AltAz, EarthLocation, get_body
 from astropy.time import Time
 from astropy.utils import iers
+from levelled_by_day import A3_ARCSEC, FOCAL, LEANING, POSE, SIGMA_PX, SIZE, solver
 
 from starpos import rotation
 from starpos.earth.place import Place
-from starpos.earth.refraction import Atmosphere
 from starpos.fix.searching import Question, answer_frame
 from starpos.fix.solution import Status
-from starpos.fix.solver import Solver
 from starpos.fix.sun import LENS_SHARE, by_sun
 from starpos.frames.frame import Disc, Stars, no_stars
-from starpos.instrument.inclinometer import InclinometerErrors, Tilt
-from starpos.instrument.instrument import Calibration, Instrument
-from starpos.sky.catalogue import load_catalogue
+from starpos.instrument.inclinometer import Tilt
 from starpos.units import ARCSEC, unix_of
 
-LATITUDE, LONGITUDE, FOCAL, SIZE, SIGMA_PX = -20.0, -50.0, 900.0, (1936, 1216), 0.1
-POSE, A3_ARCSEC, LEANING = np.radians(0.01), 30.0, -35.0
+LATITUDE, LONGITUDE = -20.0, -50.0
 RADIUS = np.radians(0.266)
 # the Moon 3 deg from Venus, Venus 17 deg from the Sun, Jupiter 7 deg from the Moon
 CLOSE = "2023-03-24T15:00:00", "moon", "venus"
 WIDE = "2023-01-01T12:00:00", "sun", "venus"
 JUPITER = "2023-01-25T15:00:00", "moon", "jupiter"
-
-
-@cache
-def solver() -> Solver:
-    instrument = Instrument(
-        FOCAL,
-        calibration=Calibration.of((LEANING, 0.0, 0.0), (A3_ARCSEC,) * 3),
-        inclinometer=InclinometerErrors(
-            pose_rad=POSE, quantum_rad=0.0, drift_rad_per_sqrt_hour=0.0, scale=0.0
-        ),
-        clock_stddev_s=0.02,
-    )
-    return Solver(
-        instrument, load_catalogue(), Atmosphere(pressure_pa=90000.0, temperature_c=15.0, humidity=0.3)
-    )
 
 
 @cache

@@ -5,39 +5,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from levelled_by_day import A3_ARCSEC, AIR, FOCAL, LEANING, POSE, SIGMA_PX, SIZE, solver
 
 from starpos import rotation
 from starpos.earth.orientation import earth_state
 from starpos.earth.place import Place
-from starpos.earth.refraction import Atmosphere
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
-from starpos.fix.solver import Solver
 from starpos.fix.sun import LENS_SHARE, by_sun
 from starpos.frames.frame import Disc, no_stars
-from starpos.instrument.inclinometer import InclinometerErrors, Tilt
-from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.inclinometer import Tilt
 from starpos.sky.bodies import MOON, SUN, body_at
-from starpos.sky.catalogue import load_catalogue
 from starpos.units import ARCSEC, unix_of
 
-AIR = Atmosphere(pressure_pa=90000.0, temperature_c=15.0, humidity=0.3)
-POSE, A3_ARCSEC, FOCAL, SIZE, SIGMA_PX = np.radians(0.01), 30.0, 900.0, (1936, 1216), 0.1
 # the Sun and the Moon 27 and 78 deg high, 72 deg apart
 WHEN, HERE = unix_of("2024-11-07T19:30:00"), Place.by_gravity(-20.0, -50.0)
-LEANING = -35.0
-
-
-def solver() -> Solver:
-    instrument = Instrument(
-        FOCAL,
-        calibration=Calibration.of((LEANING, 0.0, 0.0), (A3_ARCSEC,) * 3),
-        inclinometer=InclinometerErrors(
-            pose_rad=POSE, quantum_rad=0.0, drift_rad_per_sqrt_hour=0.0, scale=0.0
-        ),
-        clock_stddev_s=0.02,
-    )
-    return Solver(instrument, load_catalogue(), AIR)
 
 
 def seen_from_here(name: str) -> np.ndarray:
