@@ -83,10 +83,7 @@ SEARCHED = {
     "docs/tutorials/disk": ("plate solving", "plate solve", "plate solver", "astrometry", "plate scale"),
     "docs/tutorials/robot": ("GPS denied", "GNSS denied", "star tracker", "celestial navigation", "robot"),
 }
-MADE = {
-    "<!-- commands -->": about_commands,
-    "<!-- public names -->": about_names,
-}
+MADE = {"<!-- commands -->": about_commands, "<!-- public names -->": about_names}
 
 
 def fill_in(app: object, name: str, source: list[str]) -> None:

@@ -22,6 +22,6 @@ setup(
             "camera = starpos_camera.main:camera",
             "camera_detector = starpos_camera.main:camera_detector",
             "detector = starpos_camera.main:detector",
-        ],
+        ]
     },
 )

@@ -17,9 +17,5 @@ setup(
     description="The starpos inclinometer: serial protocol, driver and node.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
-    entry_points={
-        "console_scripts": [
-            "inclinometer = starpos_inclinometer.main:inclinometer",
-        ],
-    },
+    entry_points={"console_scripts": ["inclinometer = starpos_inclinometer.main:inclinometer"]},
 )

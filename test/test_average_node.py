@@ -86,10 +86,7 @@ def test_it_converges_and_its_sigma_falls_as_noise_does(graph, solver, averaged,
     instrument_file.write(
         path,
         Instrument(
-            FULL_FOCAL_PX,
-            calibration=known,
-            inclinometer=InclinometerErrors(scale=0.0),
-            clock_stddev_s=0.01,
+            FULL_FOCAL_PX, calibration=known, inclinometer=InclinometerErrors(scale=0.0), clock_stddev_s=0.01
         ),
     )
     assert graph.set("solver", calibration_url=str(path)) == (True, "")

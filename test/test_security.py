@@ -25,16 +25,7 @@ PRODUCT += [
     ROOT / package / package for package in ("starpos_camera", "starpos_inclinometer", "starpos_solver")
 ]
 # bytes that become code or objects, or call a shell
-FORBIDDEN_MODULES = {
-    "pickle",
-    "marshal",
-    "shelve",
-    "dill",
-    "cloudpickle",
-    "joblib",
-    "subprocess",
-    "xml",
-}
+FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib", "subprocess", "xml"}
 FORBIDDEN_NAMES = {"eval", "exec", "compile", "__import__"}
 FORBIDDEN_ATTRIBUTES = {
     ("os", name) for name in ("system", "popen", "execv", "execvp", "spawnv", "startfile")

@@ -54,11 +54,7 @@ def about_messages() -> str:
     return "".join(f"\n## {name}\n\n```\n{text}\n```\n" for name, text in about)
 
 
-PAGES = {
-    "parameters": about_parameters,
-    "messages": about_messages,
-    "troubleshooting": messages.page,
-}
+PAGES = {"parameters": about_parameters, "messages": about_messages, "troubleshooting": messages.page}
 
 
 def pages() -> dict[Path, str]:

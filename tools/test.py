@@ -33,13 +33,7 @@ FAST_LINTERS = [
     "lint-imports --config tools/imports.ini --no-cache",
     f"{sys.executable} tools/walls.py",
 ]
-LINTERS = [
-    *FAST_LINTERS,
-    "codespell",
-    "mypy",
-    f"{sys.executable} tools/words.py",
-    "actionlint -no-color",
-]
+LINTERS = [*FAST_LINTERS, "codespell", "mypy", f"{sys.executable} tools/words.py", "actionlint -no-color"]
 # the site of the documents, whether each file has its licence, and the package's metadata, with what the first brings
 DOCS = [
     "tools/setup/docs",
@@ -230,10 +224,7 @@ def files_in(folder: str, max_s: float = math.inf) -> list[str]:
 
 
 def parts(
-    folders: dict[str, str],
-    shares: dict[str, int],
-    without: Collection[str] = (),
-    max_s: float = math.inf,
+    folders: dict[str, str], shares: dict[str, int], without: Collection[str] = (), max_s: float = math.inf
 ) -> dict[str, list[str]]:
     """Files of tests, by the name of their part; shares: in how many parts a folder's files run, 1 by default."""
     made = {}

@@ -17,9 +17,5 @@ setup(
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},
-    entry_points={
-        "console_scripts": [
-            "dashboard = starpos_dashboard.main:dashboard",
-        ]
-    },
+    entry_points={"console_scripts": ["dashboard = starpos_dashboard.main:dashboard"]},
 )

@@ -185,7 +185,4 @@ def _remarks(message: Solution) -> list[str]:
     variance = max(message.covariance_geodetic[0], message.covariance_geodetic[4])
     error = f"{math.sqrt(variance):.0f} m" if variance >= 0 else "unknown"
     place = f"{abs(north):.5f} {'NS'[north < 0]}  {abs(east):.5f} {'EW'[east < 0]}"
-    return [
-        f"{place}  +- {error}",
-        f"heading {message.heading:.3f} +- {message.heading_stddev:.3f} deg",
-    ]
+    return [f"{place}  +- {error}", f"heading {message.heading:.3f} +- {message.heading_stddev:.3f} deg"]

@@ -17,11 +17,7 @@ from starpos_inclinometer.sources.tilts import Sca100t
 from starpos_testing.emulator import Mcu, Pty
 from starpos_testing.patience import WAIT_S
 
-COMMAND = [
-    sys.executable,
-    "-c",
-    "import sys; from starpos_testing.emulator import main; sys.exit(main())",
-]
+COMMAND = [sys.executable, "-c", "import sys; from starpos_testing.emulator import main; sys.exit(main())"]
 
 
 def readings(mcu, n):

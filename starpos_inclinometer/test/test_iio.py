@@ -13,11 +13,7 @@ from starpos.messages.tilt import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock, Moment
 from starpos_inclinometer.sources.iio import IioLink, IioSource
-from starpos_inclinometer.sources.iio_device import (
-    DeviceError,
-    find,
-    set_sampling_frequency,
-)
+from starpos_inclinometer.sources.iio_device import DeviceError, find, set_sampling_frequency
 from starpos_inclinometer.sources.source import Arrival, Phase, Surroundings
 from starpos_testing.patience import WAIT_S
 

@@ -173,9 +173,7 @@ class Imitation:
 def test_the_node_reads_an_imu(listener):
     tilts = listener.hear(Tilt, "tilt", 100)
     node = Process(
-        "starpos_inclinometer.main",
-        "inclinometer",
-        ["source:=imu", "imu.average:=0.1", "frame_id:=imu_link"],
+        "starpos_inclinometer.main", "inclinometer", ["source:=imu", "imu.average:=0.1", "frame_id:=imu_link"]
     )
     state = "inclinometer: Link"
     try:

@@ -155,8 +155,7 @@ def test_a_polynomial_far_outside_of_its_range_does_not_turn_an_axis_round():
 
 
 @pytest.mark.parametrize(
-    "odd",
-    [{"lost": 1}, {"status": SampleStatus.NO_ANSWER}, {"x": 0}, {"x": code_of(4.9)}],
+    "odd", [{"lost": 1}, {"status": SampleStatus.NO_ANSWER}, {"x": 0}, {"x": code_of(4.9)}]
 )
 def test_what_is_flagged_tells_no_noise(odd):
     s = Sca100t()

@@ -148,12 +148,7 @@ def test_the_deflection_of_the_vertical_moves_and_widens_fix_and_heading():
 
 def test_without_a_fix_every_number_that_is_missing_is_nan():
     answer = replace(
-        answer_facing(10.0),
-        status=Status.NOT_IDENTIFIED,
-        fix=None,
-        named=NO_STARS,
-        star=None,
-        message="why",
+        answer_facing(10.0), status=Status.NOT_IDENTIFIED, fix=None, named=NO_STARS, star=None, message="why"
     )
     message = outputs.solution(Header(), answer, None)
     assert not message.ids and not message.indices and not message.magnitudes

@@ -29,13 +29,7 @@ from starpos.detection import detect
 from starpos.frames.frame import Frame
 
 # Mpx: columns, rows.
-SIZES = {
-    0.5: (866, 577),
-    2: (1732, 1155),
-    8: (3464, 2309),
-    21: (5616, 3744),
-    60: (9488, 6324),
-}
+SIZES = {0.5: (866, 577), 2: (1732, 1155), 8: (3464, 2309), 21: (5616, 3744), 60: (9488, 6324)}
 STARS_PER_MPX, STAR_COUNTS, HOT = 15, (10, 100, 1000, 5000), (0.0001, 0.001, 0.003)
 # Of 8 bits and of a mosaic: Mpx, stars.
 KINDS = ((2, 30), (2, 1000), (21, 315), (21, 5000))

@@ -25,11 +25,7 @@ from table import by_turns, circumstances, digits, show, spent_ms, time_text
 # Callgrind counts while this function of libffi runs, by which ctypes makes a call, and writes a file at its end.
 GATE = "ffi_call"
 # A name: columns, rows; stars. The second is the first with four pixels made one.
-FRAMES = {
-    "21 Mpx": (SIZES[21], 315),
-    "5 Mpx (21 binned 2 x 2)": ((2808, 1872), 315),
-    "2 Mpx": (SIZES[2], 30),
-}
+FRAMES = {"21 Mpx": (SIZES[21], 315), "5 Mpx (21 binned 2 x 2)": ((2808, 1872), 315), "2 Mpx": (SIZES[2], 30)}
 # A node's work on a frame besides detection, or without it, in million instructions a megapixel. It is not counted, but
 # derived from the CPU time of the nodes in docs/evidence/speed.md, less detection's, at 7.4 instructions a ns as
 # detection has.

@@ -42,12 +42,7 @@ class KeptTables(Generic[Table]):
     """
 
     def __init__(
-        self,
-        kind: type[Table],
-        prefix: str,
-        number_kinds: str,
-        what: str = "",
-        most: int = 1,
+        self, kind: type[Table], prefix: str, number_kinds: str, what: str = "", most: int = 1
     ) -> None:
         self.kind, self.prefix, self.number_kinds = kind, prefix, number_kinds
         self.what, self.most = what, most

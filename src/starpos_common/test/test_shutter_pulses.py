@@ -114,12 +114,7 @@ def test_another_exposure_is_learned_anew():
 
 
 @pytest.mark.parametrize(
-    ("faults", "said"),
-    [
-        (("missed",), "no pulse"),
-        (("double",), "2 pulses"),
-        (("lost",), "lost near it"),
-    ],
+    ("faults", "said"), [(("missed",), "no pulse"), (("double",), "2 pulses"), (("lost",), "lost near it")]
 )
 def test_a_frame_without_a_pulse_says_why(faults, said):
     camera = Camera(4)

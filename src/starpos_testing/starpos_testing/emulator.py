@@ -223,11 +223,7 @@ class Mcu:
 
     def _identify(self) -> bytes:
         return identity_line(
-            self._rate_hz,
-            delay_ms(self._rate_hz),
-            version=PROTOCOL_VERSION,
-            firmware=FIRMWARE,
-            unit=UNIT,
+            self._rate_hz, delay_ms(self._rate_hz), version=PROTOCOL_VERSION, firmware=FIRMWARE, unit=UNIT
         )
 
     def _code(self, angle: float) -> int:

@@ -323,11 +323,7 @@ class _Normal:
 
 
 def _fitted(
-    circles_of: CirclesOf,
-    given: Calibration,
-    ray: np.ndarray,
-    zenith: np.ndarray,
-    zenith_sigma: float | None,
+    circles_of: CirclesOf, given: Calibration, ray: np.ndarray, zenith: np.ndarray, zenith_sigma: float | None
 ) -> FoundAxis | None:
     """The answer near a zenith; None if it does not converge."""
     a3, frames, now = given.a3, 0, None

@@ -10,15 +10,7 @@ import numpy as np
 from starpos import rotation
 from starpos.averaging.poses import poses_of
 from starpos.averaging.scatter import Scatter
-from starpos.calibration.plumb_line import (
-    MIN_POSES,
-    PlumbLine,
-    Readings,
-    hang,
-    level,
-    settled,
-    typical,
-)
+from starpos.calibration.plumb_line import MIN_POSES, PlumbLine, Readings, hang, level, settled, typical
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.place import Place
 from starpos.errors import FixError

@@ -108,7 +108,7 @@ def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
     if np.isnan(errors).any():
         console.complain(
             f"{int(np.isnan(errors[:, 0]).sum())} points lie further out than any identified star, where the lens is not "
-            "known: calibrate it with starpos calibrate --camera --site",
+            "known: calibrate it with starpos calibrate --camera --site"
         )
     columns = (
         points[:, 0],

@@ -34,11 +34,7 @@ from starpos.identification import Identification
 from starpos.instrument import instrument_file, platepar
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import up_of
-from starpos.instrument.instrument import (
-    SAG_ARCSEC_PER_SQRT_HOUR,
-    Calibration,
-    Instrument,
-)
+from starpos.instrument.instrument import SAG_ARCSEC_PER_SQRT_HOUR, Calibration, Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.night import horizon
 from starpos.night.extinction import light_of
@@ -451,7 +447,7 @@ def _write_platepar(
     plate, worst = platepar.platepar_of(camera, seen)
     save(path, (json.dumps(plate, indent=4, sort_keys=True) + "\n").encode(), "the platepar")
     console.complain(
-        f"{path}: RMS sees stars within {worst:.2f} px of this camera; the platepar has no photometry",
+        f"{path}: RMS sees stars within {worst:.2f} px of this camera; the platepar has no photometry"
     )
 
 
@@ -485,7 +481,7 @@ def _tell_what_tilts_would(fit: Intrinsics, air: Atmosphere, frames: Sequence[St
     cost = np.hypot(cost, UNTIMED * timeless)
     console.complain(
         f"without --tilt {what} is not known: {1e6 * cost:.0f} ppm, {cost * fit.camera.fx:.2g} px, of fx "
-        f"and fy, which their sigmas include",
+        f"and fy, which their sigmas include"
     )
 
 

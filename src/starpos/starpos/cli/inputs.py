@@ -103,11 +103,7 @@ def seen_at(args: argparse.Namespace, place: Place) -> Iterator[tuple[Frame | St
 
 
 def identifying(
-    args: argparse.Namespace,
-    frames: Sequence[str],
-    read: Reader,
-    workers: Workers,
-    search_s: float,
+    args: argparse.Namespace, frames: Sequence[str], read: Reader, workers: Workers, search_s: float
 ) -> Solving:
     """The work that identifies frames with the camera of the options, else of their headers, else of any scale."""
     (about,) = workers.map([(First(read), tuple(frames))])

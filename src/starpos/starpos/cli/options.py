@@ -172,7 +172,7 @@ def tell_unknown(args: argparse.Namespace, deflection: Deflection) -> None:
     if args.geoid is not None and not deflection.known:
         stddev = deflection.stddev_arcsec
         console.complain(
-            f"{args.geoid}: no data around this place; the deflection is unknown, {stddev:.2g} arcsec",
+            f"{args.geoid}: no data around this place; the deflection is unknown, {stddev:.2g} arcsec"
         )
 
 

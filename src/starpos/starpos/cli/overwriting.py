@@ -91,7 +91,7 @@ def save_instrument(name: str, found: Instrument, about: str, *, camera_found: b
     instrument_file.update(Path(name), found, about, camera_found=camera_found)
     if arcsec := instrument_file.read(name, needs_camera=False).calibration.remounted_arcsec:
         console.complain(
-            f"{name} keeps remounted_arcsec: {arcsec:g}: A3 is new, so take it out unless you remount again",
+            f"{name} keeps remounted_arcsec: {arcsec:g}: A3 is new, so take it out unless you remount again"
         )
 
 

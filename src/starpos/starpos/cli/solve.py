@@ -29,14 +29,7 @@ from starpos.night.opening import work_of
 from starpos.night.reading import NO_CAMERA, About, First, Instruments
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, of_inclinometer
 from starpos.night.solving import How, NightAnswers, answers_of
-from starpos.night.together import (
-    FrameAnswer,
-    Gathered,
-    TurnedNight,
-    from_elevations,
-    together,
-    turned,
-)
+from starpos.night.together import FrameAnswer, Gathered, TurnedNight, from_elevations, together, turned
 from starpos.night.work import OnFile, Solving
 from starpos.sky import catalogue
 from starpos.units import utc_text

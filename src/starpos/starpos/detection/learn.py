@@ -232,12 +232,7 @@ class Lesson:
     reach: int
 
 
-def learn(
-    sky: SkyPlane,
-    x: np.ndarray,
-    y: np.ndarray,
-    height: np.ndarray,
-) -> Lesson:
+def learn(sky: SkyPlane, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Lesson:
     """Learn from the peaks x, y (N,) int px and their height (N,), highest first; defaults where they teach nothing."""
     response = Response(np.ones(len(sky.level)), 0.3, 0.0, 0.0)
     psf, stamps, x, y = _teachers(sky, x, y, height)
@@ -272,10 +267,7 @@ def learn(
 
 
 def _teachers(
-    sky: SkyPlane,
-    x: np.ndarray,
-    y: np.ndarray,
-    height: np.ndarray,
+    sky: SkyPlane, x: np.ndarray, y: np.ndarray, height: np.ndarray
 ) -> tuple[Psf, Stamps, np.ndarray, np.ndarray]:
     """The isolated bright stars: a Gaussian Psf of their shape, their Stamps and their centroids x, y (N,) px."""
     clear = np.ones(len(x), bool)
@@ -361,14 +353,7 @@ def _most_alike(light: np.ndarray) -> np.ndarray:
     reach = light.shape[1] // 2
     widest = (reach / 2) ** 2
     shape, values = own_shapes(
-        light,
-        (reach / 4) ** 2,
-        NARROWEST_WINDOW,
-        NARROWEST,
-        widest,
-        OWN_ROUNDS,
-        CENTRINGS,
-        FARTHEST,
+        light, (reach / 4) ** 2, NARROWEST_WINDOW, NARROWEST, widest, OWN_ROUNDS, CENTRINGS, FARTHEST
     )
     xx, xy, yy = (shape[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     look = np.stack([np.log(xx + yy) / 2, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)])

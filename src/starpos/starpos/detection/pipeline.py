@@ -146,13 +146,7 @@ class _Picture:
         settings = self.settings
         if settings.saturation_dn is not None:
             settings = replace(settings, saturation_dn=settings.saturation_dn * 4 / gain)
-        smaller = replace(
-            self,
-            plane=plane,
-            mosaic=False,
-            settings=settings,
-            halvings=self.halvings - 1,
-        )
+        smaller = replace(self, plane=plane, mosaic=False, settings=settings, halvings=self.halvings - 1)
         return smaller, gain
 
 
@@ -179,13 +173,7 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
     # OpenCV would take all processors for a little, and wait for them where others work
     cv2.setNumThreads(settings.threads)
     plane, mosaic = plane_of(frame)
-    picture = _Picture(
-        plane=plane,
-        mosaic=mosaic,
-        settings=settings,
-        exposure=frame,
-        halvings=MAX_HALVINGS,
-    )
+    picture = _Picture(plane=plane, mosaic=mosaic, settings=settings, exposure=frame, halvings=MAX_HALVINGS)
     found = _detect(picture)
     return replace(found, stars=replace(found.stars, disc=find_disc(plane)))
 
@@ -258,10 +246,7 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     found = found[: settings.max_stars]
     columns: dict[str, Any] = {name: found[name] for name in COLUMNS}
     stars = Stars(
-        **columns,
-        fwhm_px=fwhm_px,
-        window=window_of(plane, int(peaks.highest.max()), level),
-        **picture.facts,
+        **columns, fwhm_px=fwhm_px, window=window_of(plane, int(peaks.highest.max()), level), **picture.facts
     )
     return Detection(
         stars=stars,

@@ -161,11 +161,7 @@ REACH, MIN_REACH = 6.0, 12
 
 
 def with_clipped(
-    stars: np.ndarray,
-    sky: SkyPlane,
-    x: np.ndarray,
-    y: np.ndarray,
-    fwhm_px: float,
+    stars: np.ndarray, sky: SkyPlane, x: np.ndarray, y: np.ndarray, fwhm_px: float
 ) -> np.ndarray:
     """The measured stars and the clipped ones among the peaks x, y (N,) int px, brightest first.
 

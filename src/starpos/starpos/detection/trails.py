@@ -383,13 +383,7 @@ def _fitted(light: np.ndarray, line: np.ndarray, sigma: float) -> FrameTrail | N
     steady = bool(sharp and rough < UNSTEADY and (least > FAINTEST * best[7:].max()).all())
     if not steady and last - first < 4 * SHORTEST_SIGMAS * sigma:
         return None
-    return FrameTrail(
-        ends=ends,
-        covariance=end_covariance,
-        snr=snr,
-        cut=edge < BAND * sigma,
-        steady=steady,
-    )
+    return FrameTrail(ends=ends, covariance=end_covariance, snr=snr, cut=edge < BAND * sigma, steady=steady)
 
 
 def _hidden_px(light: np.ndarray, end: np.ndarray, way: np.ndarray, sigma: float) -> float:

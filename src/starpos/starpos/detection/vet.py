@@ -66,12 +66,7 @@ MEASURED = np.dtype(
 
 
 def measure(
-    sky: SkyPlane,
-    x: np.ndarray,
-    y: np.ndarray,
-    lesson: Lesson,
-    min_snr: float,
-    chunk: int,
+    sky: SkyPlane, x: np.ndarray, y: np.ndarray, lesson: Lesson, min_snr: float, chunk: int
 ) -> np.ndarray:
     """Measure the stars among the peaks x, y (N,) int px: an array of MEASURED, in no order.
 
@@ -121,12 +116,7 @@ def measure(
 
 
 def _measured(
-    stamps: Stamps,
-    fit: Fit,
-    sky: SkyPlane,
-    lesson: Lesson,
-    min_snr: float,
-    wanted: np.ndarray,
+    stamps: Stamps, fit: Fit, sky: SkyPlane, lesson: Lesson, min_snr: float, wanted: np.ndarray
 ) -> np.ndarray:
     """The fitted stars as `measure` gives them, of those that are wanted (N,) and are stars.
 

@@ -10,13 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.ellipsoid import (
-    ECCENTRICITY2,
-    curvature_radii_m,
-    enu_axes,
-    meridian_turn,
-    place_of_zenith,
-)
+from starpos.earth.ellipsoid import ECCENTRICITY2, curvature_radii_m, enu_axes, meridian_turn, place_of_zenith
 from starpos.errors import InstrumentError
 from starpos.frozen import at_once
 from starpos.rotation import full_turn

@@ -44,13 +44,7 @@ from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky
 from starpos.identification._frame import FrameStars, all_within, ideal_frame, mean_sigma, unit_vectors
 from starpos.identification.pose import MIN_SIGMA_PX, TEST_STARS
 from starpos.identification.prior import AimPrior, Hint
-from starpos.identification.search import (
-    Look,
-    Priors,
-    identify_near,
-    second_look,
-    through,
-)
+from starpos.identification.search import Look, Priors, identify_near, second_look, through
 from starpos.identification.triangles import TriangleCatalogue, cached_triangles
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.inclinometer import EITHER_WAY, Tilt

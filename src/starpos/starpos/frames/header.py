@@ -298,9 +298,7 @@ def read_times(header: Mapping, comments: Mapping[str, str] = NO_COMMENTS) -> Ex
     except TimeError as e:
         return Exposure(exposure_s=exposure_s, untimed=str(e))
     return Exposure(
-        mid_unix_s=mid_unix_s,
-        exposure_s=exposure_s,
-        stamp_stddev_s=math.hypot(best.stddev_s, apart_s, off_s),
+        mid_unix_s=mid_unix_s, exposure_s=exposure_s, stamp_stddev_s=math.hypot(best.stddev_s, apart_s, off_s)
     )
 
 

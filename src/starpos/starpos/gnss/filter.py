@@ -48,11 +48,7 @@ class Innovation:
 
 
 def innovation(
-    sighting: Fix,
-    gnss: Place,
-    learned: Learned,
-    vertical: Vertical,
-    up_in_camera: np.ndarray | None = None,
+    sighting: Fix, gnss: Place, learned: Learned, vertical: Vertical, up_in_camera: np.ndarray | None = None
 ) -> Innovation:
     """Compare the plumb line that GNSS and the deflection expect with the one by the stars and the tilt.
 

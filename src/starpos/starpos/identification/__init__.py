@@ -11,12 +11,4 @@ from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.search import MIN_STARS, field_of, identify
 from starpos.identification.sky import Sky
 
-__all__ = [
-    "MIN_STARS",
-    "Identification",
-    "PlumbPrior",
-    "PointingPrior",
-    "Sky",
-    "field_of",
-    "identify",
-]
+__all__ = ["MIN_STARS", "Identification", "PlumbPrior", "PointingPrior", "Sky", "field_of", "identify"]

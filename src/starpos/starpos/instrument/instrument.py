@@ -272,9 +272,7 @@ class Calibration:
 
     @classmethod
     def of(
-        cls,
-        misalignment_deg: Sequence[float],
-        stddev_arcsec: Sequence[float] = UNKNOWN_ARCSEC,
+        cls, misalignment_deg: Sequence[float], stddev_arcsec: Sequence[float] = UNKNOWN_ARCSEC
     ) -> "Calibration":
         """Make a Calibration from three angles and the standard deviations (3,) about S's axes."""
         for name, numbers in (

@@ -10,12 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.orientation import (
-    ROTATION_RAD_S,
-    earth_orientation,
-    earth_state,
-    station_velocity,
-)
+from starpos.earth.orientation import ROTATION_RAD_S, earth_orientation, earth_state, station_velocity
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError

@@ -24,13 +24,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS
 from starpos.night.night import Night, Shot, Truth, why_none
 from starpos.night.remarks import Remark
-from starpos.night.together import (
-    FrameAnswer,
-    Gathered,
-    TurnedNight,
-    together,
-    turned,
-)
+from starpos.night.together import FrameAnswer, Gathered, TurnedNight, together, turned
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
 from starpos.rotation import half_turns

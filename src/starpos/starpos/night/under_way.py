@@ -108,9 +108,7 @@ class Records:
         return adjust_voyage(sightings, imu, velocity, vessel, times, progress)
 
 
-def voyage_frames(
-    answers: Iterable[VoyageFrame | FrameError],
-) -> list[VoyageFrame]:
+def voyage_frames(answers: Iterable[VoyageFrame | FrameError]) -> list[VoyageFrame]:
     """The answers of `IdentifyingVoyage`; a frame that cannot be read has only its sentence."""
     return [VoyageFrame(None, None, str(a)) if isinstance(a, FrameError) else a for a in answers]
 

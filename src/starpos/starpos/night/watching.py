@@ -200,11 +200,7 @@ def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
             alarm = bool(weight @ [_chance(x) for x in chi2] < ALARM_CHANCE)
         found.append(
             Kept(
-                pose=pose,
-                nights=len(before),
-                turned=turned,
-                sigma=np.sqrt(np.diag(covariance)),
-                alarm=alarm,
+                pose=pose, nights=len(before), turned=turned, sigma=np.sqrt(np.diag(covariance)), alarm=alarm
             )
         )
         if alarm:

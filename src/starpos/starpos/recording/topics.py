@@ -153,10 +153,7 @@ class Chosen:
 
 
 def instrument_in(
-    bag: BagReader,
-    namespace: str | None,
-    topics: Mapping[str, str],
-    remaps: Remaps = NO_REMAPS,
+    bag: BagReader, namespace: str | None, topics: Mapping[str, str], remaps: Remaps = NO_REMAPS
 ) -> Chosen:
     """Find namespace and connections of an instrument, or of a robot's own drivers without an instrument.
 

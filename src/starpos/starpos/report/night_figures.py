@@ -334,14 +334,7 @@ def _draw_map(axes: "Axes", timed: Sequence[Watched]) -> None:
         if which:
             seen = np.array([km(p.latitude, p.longitude) for p in which])
             axes.plot(
-                *seen.T,
-                "D",
-                color=colour,
-                ms=4,
-                mec="black",
-                mew=0.4,
-                label=f"GNSS, {status}",
-                zorder=3,
+                *seen.T, "D", color=colour, ms=4, mec="black", mew=0.4, label=f"GNSS, {status}", zorder=3
             )
     axes.set(xlabel="east, km", ylabel="north, km")
     axes.set_aspect("equal", adjustable="datalim")

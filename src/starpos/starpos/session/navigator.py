@@ -55,10 +55,7 @@ class NavigatorSettings(NodeSettings):
         stated = (
             {}
             if np.isnan(height)
-            else {
-                "height_m": height,
-                "height_stddev_m": max(values["altitude_stddev"], MIN_HEIGHT_STDDEV_M),
-            }
+            else {"height_m": height, "height_stddev_m": max(values["altitude_stddev"], MIN_HEIGHT_STDDEV_M)}
         )
         return Vessel(
             vehicle=values["vehicle"] or None,

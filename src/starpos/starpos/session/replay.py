@@ -239,10 +239,7 @@ class Playing:
         night = PlayedNight(instrument=settings.instrument(None))
         said = _Said(night)
         replay = Replay(
-            settings,
-            said,
-            said,
-            Drivers.of(self.params_file, self.given, self.namespace, self.remaps),
+            settings, said, said, Drivers.of(self.params_file, self.given, self.namespace, self.remaps)
         )
         try:
             for output in play(replay):

@@ -71,10 +71,7 @@ def write_photographs(
     written = []
     for k, (azimuth_deg, altitude_deg, roll_deg) in enumerate(POSES_DEG):
         now = replace(
-            scene,
-            azimuth_deg=scene.azimuth_deg + azimuth_deg,
-            altitude_deg=altitude_deg,
-            roll_deg=roll_deg,
+            scene, azimuth_deg=scene.azimuth_deg + azimuth_deg, altitude_deg=altitude_deg, roll_deg=roll_deg
         )
         start, exposure_s = begin + k * CADENCE_S, EXPOSURE_TENTHS_S / 10
         frame = render(now, expose(now, catalogue, start, exposure_s, rng), start, exposure_s, rng)

@@ -220,10 +220,7 @@ class _Fit:
 
 
 def adjusted(
-    sightings: Sequence[ZenithSighting],
-    instrument: Instrument,
-    atmosphere: Atmosphere,
-    mark: Place,
+    sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Place
 ) -> DeflectionSession:
     """The deflection of a session; sightings: at least three, in any order.
 
@@ -262,11 +259,7 @@ class _Session:
     """
 
     def __init__(
-        self,
-        sightings: Sequence[ZenithSighting],
-        instrument: Instrument,
-        atmosphere: Atmosphere,
-        mark: Place,
+        self, sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Place
     ) -> None:
         c = instrument.calibration
         self.given, self.mark, self.inclinometer = c, mark, instrument.inclinometer

@@ -69,10 +69,7 @@ def test_one_lean_is_right_at_that_lean_and_wide_at_another(catalogue, rng, fram
     assert metres < 4 * 390 * np.sqrt(1 + 1 / frames)
     assert sigma_m(same) < 3000
     # As wide as the turn is unknown: sideways and, beyond half a turn, along the lean.
-    for lean in (
-        -4.0,
-        4.0,
-    ):
+    for lean in (-4.0, 4.0):
         there = shots(catalogue, rng, [lean], start=START + 900)
         other, metres, sigmas = solved(there, found, catalogue)
         assert sigmas < 3

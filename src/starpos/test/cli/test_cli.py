@@ -8,16 +8,7 @@ import struct
 
 import numpy as np
 import pytest
-from cli_calls import (
-    IDENTIFY_KEYS,
-    KNOWN,
-    PLACE,
-    SOLVE_KEYS,
-    WIDE,
-    objects,
-    solve,
-    without_focal_length,
-)
+from cli_calls import IDENTIFY_KEYS, KNOWN, PLACE, SOLVE_KEYS, WIDE, objects, solve, without_focal_length
 
 from starpos.cli import main
 from starpos_testing.command_line import SENSOR, run

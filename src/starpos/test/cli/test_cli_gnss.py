@@ -68,10 +68,7 @@ def test_without_tilts_there_are_headings(drive, capsys):
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [
-        (("--self-calibrate",), "do not go together"),
-        (("--site", "47", "8"), "give one of the two"),
-    ],
+    [(("--self-calibrate",), "do not go together"), (("--site", "47", "8"), "give one of the two")],
 )
 def test_options_that_contradict_each_other_are_refused(drive, capsys, options, said):
     status, _, errors = solve(capsys, drive, *options)

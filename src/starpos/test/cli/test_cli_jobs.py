@@ -26,9 +26,7 @@ from starpos_testing.patience import WAIT_S
 
 
 @pytest.mark.parametrize(
-    ("more", "jobs"),
-    [(("--json", "--self-calibrate"), 3), ((), "auto")],
-    ids=["turned", "table of each"],
+    ("more", "jobs"), [(("--json", "--self-calibrate"), 3), ((), "auto")], ids=["turned", "table of each"]
 )
 def test_solve_gives_the_same_however_many_processes(more, jobs, archive, capfd):
     one = run(capfd, solve(archive / "turned", *more))
@@ -162,14 +160,7 @@ def started(archive, times=13, **options):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
     # A shell's background ignores it.
     process = subprocess.Popen(
-        [
-            "env",
-            "--default-signal=INT",
-            sys.executable,
-            "-m",
-            "starpos",
-            *command,
-        ],
+        ["env", "--default-signal=INT", sys.executable, "-m", "starpos", *command],
         text=True,
         start_new_session=True,
         **pipes,

@@ -243,8 +243,7 @@ def test_rows_of_options_state_the_bounds_that_the_code_has(command, name, most)
 
 
 @pytest.mark.parametrize(
-    ("line", "completed"),
-    [("starpos so", "solve "), ("starpos solve --lens e", "equidistant ")],
+    ("line", "completed"), [("starpos so", "solve "), ("starpos solve --lens e", "equidistant ")]
 )
 def test_the_tab_key_completes_commands_and_options(line, completed, tmp_path):
     require("argcomplete")

@@ -9,12 +9,7 @@ from starpos.frames.frame import PATTERNS, Frame
 from starpos_testing.skies.rendered import field, grid, match
 
 # OpenCV's names of them.
-OF_MOSAIC = {
-    "rggb": "BayerBG",
-    "grbg": "BayerGB",
-    "bggr": "BayerRG",
-    "gbrg": "BayerGR",
-}
+OF_MOSAIC = {"rggb": "BayerBG", "grbg": "BayerGB", "bggr": "BayerRG", "gbrg": "BayerGR"}
 
 
 def mosaic(rng, size=(520, 520), electrons=12000.0, black=0.0):

@@ -94,10 +94,7 @@ def test_sigma_follows_what_was_measured():
     guessed = Atmosphere.measured(None, None)
     assert guessed.relative_sigma > 20 * known.relative_sigma / 2
     # The air at 3000 m, and of a hot day by the sea.
-    for pressure, temperature in (
-        (70_000, -5),
-        (101_300, 30),
-    ):
+    for pressure, temperature in ((70_000, -5), (101_300, 30)):
         true = Atmosphere(pressure_pa=pressure, temperature_c=temperature).refraction().a
         assert abs(guessed.refraction().a / true - 1) < 3 * guessed.relative_sigma
     numerical = (

@@ -275,8 +275,7 @@ def test_an_absurd_header_is_refused(tmp_path, data, cards):
 
 
 @pytest.mark.parametrize(
-    ("name", "content"),
-    [("a.png", huge_png()), ("a.fits", huge_fits().replace(b"999999999", b"    99999"))],
+    ("name", "content"), [("a.png", huge_png()), ("a.fits", huge_fits().replace(b"999999999", b"    99999"))]
 )
 def test_a_header_that_claims_gigabytes_is_refused_before_any_is_taken(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)

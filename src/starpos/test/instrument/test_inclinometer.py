@@ -6,14 +6,7 @@ import pytest
 from starpos import rotation
 from starpos.errors import TiltError, TiltRangeError
 from starpos.instrument import sensors
-from starpos.instrument.inclinometer import (
-    InclinometerErrors,
-    Tilt,
-    level_of,
-    levelling_of,
-    up_of,
-    up_slope,
-)
+from starpos.instrument.inclinometer import InclinometerErrors, Tilt, level_of, levelling_of, up_of, up_slope
 
 DEG = np.pi / 180
 NO_ERROR = np.zeros((2, 2))

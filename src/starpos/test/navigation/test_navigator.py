@@ -282,11 +282,7 @@ def test_a_heading_at_a_known_place_claims_what_it_errs_by_when_the_mount_is_kno
     for frame, (latitude, longitude, body_to_itrs) in zip(record.frames, truth, strict=True):
         place = Place.by_gravity(*np.degrees([latitude, longitude]), Deflection(0.0, 0.0, 0.0))
         seen = frame.placeless()
-        placeless = PlacelessFrame(
-            utc_unix_s=frame.utc_unix_s,
-            stamp_stddev_s=0.0,
-            camera=seen,
-        )
+        placeless = PlacelessFrame(utc_unix_s=frame.utc_unix_s, stamp_stddev_s=0.0, camera=seen)
         found = body_attitude(placeless, place, there)
         off = rotation.to_small_vector(found.rotation @ (enu_axes(latitude, longitude) @ body_to_itrs).T)
         nees.append(off @ np.linalg.solve(found.covariance, off))

@@ -118,14 +118,7 @@ def test_a_recorded_night_becomes_one_too(tmp_path, capsys):
     pytest.importorskip("rosbags")
     path, truth = tmp_path / "bag.zip", json.loads(BAG.with_suffix(".json").read_text())
     a3 = map(str, truth["misalignment_deg"])
-    known = (
-        "--misalignment",
-        *a3,
-        "--misalignment-stddev",
-        "5",
-        "--inclinometer",
-        "sca100t_calibrated",
-    )
+    known = ("--misalignment", *a3, "--misalignment-stddev", "5", "--inclinometer", "sca100t_calibrated")
     assert main(["report", str(BAG), "--field", str(path), *known]) == 0
     count = sum(name.startswith("stars_") for name in packed(path))
     assert count > 0 and f"{count} frames" in capsys.readouterr().out
@@ -138,10 +131,7 @@ def test_a_night_without_tilts_or_two_nights_are_refused(night, tmp_path, capsys
     bare = tmp_path / "bare"
     bare.mkdir()
     (bare / "a.csv").write_bytes((night / "stars_0000.csv").read_bytes())
-    for arguments, said in (
-        ((str(bare),), "no tilts"),
-        ((str(night), str(bare)), "one night: give one"),
-    ):
+    for arguments, said in (((str(bare),), "no tilts"), ((str(night), str(bare)), "one night: give one")):
         assert main(["report", *arguments, "--field", str(tmp_path / "x.zip"), *KNOWN]) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
         assert said in line

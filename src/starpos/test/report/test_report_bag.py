@@ -109,14 +109,7 @@ def test_the_recorded_night_of_the_repository(tmp_path, capsys):
     truth = json.loads(RECORDED.with_suffix(".json").read_text())
     air = ("--pressure-hpa", truth["pressure_pa"] / 100, "--temperature-c", truth["temperature_c"],
            "--humidity", truth["humidity"])  # fmt: skip
-    about = (
-        *air,
-        "--misalignment",
-        *truth["misalignment_deg"],
-        "--misalignment-stddev",
-        5,
-        *SENSOR,
-    )
+    about = (*air, "--misalignment", *truth["misalignment_deg"], "--misalignment-stddev", 5, *SENSOR)
     status, _, errors = run(capsys, "report", RECORDED, "-o", tmp_path / "out", *about)
     page = Page(tmp_path / "out" / "index.html")
     assert (status, errors) == (0, [])

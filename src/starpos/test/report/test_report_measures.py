@@ -51,11 +51,7 @@ def night(latitudes, longitudes, headings, truth=None, own_m=100.0, common_m=50.
             message="",
             utc_unix_s=1.8e9 + k,
             place=PlaceFix(
-                utc_unix_s=1.8e9 + k,
-                latitude=angles[0],
-                longitude=angles[1],
-                heading=angles[2],
-                terms=terms,
+                utc_unix_s=1.8e9 + k, latitude=angles[0], longitude=angles[1], heading=angles[2], terms=terms
             ),  # fmt: skip,
         )
         for k, angles in enumerate(zip(latitudes, longitudes, headings, strict=True))

@@ -180,11 +180,7 @@ def test_an_old_attitude_is_of_no_use_until_the_bias_is_known(gyro, first, solve
     assert not gyro.predicted(frame_at(stars, 30.0), solver)
 
 
-WRONG = {
-    "in deg/s": np.degrees,
-    "axes exchanged": lambda w: w[[1, 2, 0]],
-    "of the other sign": lambda w: -w,
-}
+WRONG = {"in deg/s": np.degrees, "axes exchanged": lambda w: w[[1, 2, 0]], "of the other sign": lambda w: -w}
 
 
 @pytest.mark.parametrize("kind", WRONG)

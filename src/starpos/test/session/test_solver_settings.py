@@ -14,13 +14,7 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.parameters.table import defaults_of, parameters_of
-from starpos.session.settings import (
-    atmosphere_of,
-    check_camera,
-    instrument_of,
-    known_instrument,
-    vertical_of,
-)
+from starpos.session.settings import atmosphere_of, check_camera, instrument_of, known_instrument, vertical_of
 
 CAMERA = Camera.from_focal(100, 80, 1000.0)
 

@@ -14,13 +14,7 @@ from starpos.units import MAS
 N = 60
 # mas a coordinate of Tycho-2's places at 1991, mas/yr of its motions
 SIGMA, SIGMA_PM = 30.0, 2.0
-FORMATS = {
-    "csv": "ascii.csv",
-    "csv.gz": "ascii.csv",
-    "ecsv": "ascii.ecsv",
-    "fits": "fits",
-    "vot": "votable",
-}
+FORMATS = {"csv": "ascii.csv", "csv.gz": "ascii.csv", "ecsv": "ascii.ecsv", "fits": "fits", "vot": "votable"}
 
 
 @pytest.fixture

@@ -17,11 +17,7 @@ from starpos_testing.skies.scenes import EXPOSURE, START
 AIR = Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
 VACUUM = Atmosphere(pressure_pa=0.0, temperature_c=10.0, humidity=0.0)
 # field of view in deg: size, focal length, limit of the stars
-FIELDS = {
-    3.4: ((5616, 3744), 93750.0, 10.0),
-    11: ((1024, 768), 5118.0, 8.0),
-    25: ((1000, 700), 2750.0, 6.8),
-}
+FIELDS = {3.4: ((5616, 3744), 93750.0, 10.0), 11: ((1024, 768), 5118.0, 8.0), 25: ((1000, 700), 2750.0, 6.8)}
 # 1 sigma of what k1, k2, p1, p2, k3 shift the corner by.
 CORNER = (0.008, 0.002, 0.001, 0.001, 0.0005)
 
