@@ -12,6 +12,7 @@ from starpos_testing.graph.graph import Graph
 from starpos_testing.graph.shots import SOLVER
 from starpos_testing.graph.tf2_messages import built
 from starpos_testing.nodes import take_domain
+from starpos_testing.prepared import forked
 
 ROOT = Path(__file__).parents[1]
 # a process of its own, as the test's has no tf2_msgs: a line for each transform
@@ -40,7 +41,7 @@ def domain():
 
 @pytest.fixture(scope="module")
 def graph(domain):
-    graph = Graph()
+    graph = Graph(forked)
     yield graph
     graph.close()
 

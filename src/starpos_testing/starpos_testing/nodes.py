@@ -3,8 +3,8 @@
 
 import atexit
 import os
-import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -25,6 +25,7 @@ from rclpy.signals import SignalHandlerOptions
 from starpos.errors import StarposError
 from starpos_testing.domain import own_domain
 from starpos_testing.patience import WAIT_S
+from starpos_testing.prepared import forked
 
 
 @cache
@@ -137,28 +138,27 @@ class Listener:
 
 
 class Process:
-    """The function `executable` of a module, run as a program."""
+    """The function `executable` of a module, run as a program; its output goes to a file."""
 
     def __init__(self, module: str, executable: str, parameters, namespace: str = "/"):
         program = f"import sys; from {module} import {executable}; sys.exit({executable}())"
         options = [word for p in parameters for word in ("-p", p)]
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", program, "--ros-args", "-r", f"__ns:={namespace}", *options],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        command = [sys.executable, "-c", program, "--ros-args", "-r", f"__ns:={namespace}", *options]
+        self._open = ExitStack()
+        self._out = self._open.enter_context(tempfile.TemporaryFile("w+"))
+        self._process = forked(command, module.split(".")[0], self._out)
 
     def end(self, *signals) -> tuple[int, str]:
         """Send the signals; returns the exit status and all output."""
         for number in signals:
             self._process.send_signal(number)
-        out, _ = self._process.communicate(timeout=WAIT_S)
-        return self._process.returncode, out
+        status = self._process.wait(WAIT_S)
+        self._out.seek(0)
+        with self._open:
+            return status, self._out.read()
 
     def kill(self):
         """Kill the program if a test has left it running."""
-        if self._process.poll() is None:
-            self._process.kill()
-        # This closes the pipe.
-        self._process.communicate()
+        self._process.kill()
+        self._process.wait()
+        self._open.close()

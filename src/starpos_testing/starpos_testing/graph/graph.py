@@ -19,6 +19,7 @@ from sensor_msgs.msg import CameraInfo, Image, Imu, NavSatFix
 from starpos_interfaces.msg import Capture, Solution, StarArray, Tilt
 from starpos_testing.nodes import take_all
 from starpos_testing.patience import WAIT_S
+from starpos_testing.prepared import Program, interpreted
 
 # Until another photograph is sent: nodes that have not met lose it.
 AGAIN_S = 2.0
@@ -31,12 +32,12 @@ def executable(package: str, name: str) -> str:
 class Executable:
     """An executable of this workspace as a process; its output goes to a file, as a pipe without a reader blocks."""
 
-    def __init__(self, log: Path, package: str, name: str, arguments=(), parameters=()):
+    def __init__(self, log: Path, package: str, name: str, arguments=(), parameters=(), start=interpreted):
         options = [word for p in parameters for word in ("-p", p)]
         command = [executable(package, name), *arguments, *(["--ros-args", *options] if options else [])]
         self.name, self.log = name, log
         with log.open("w") as out:
-            self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
+            self.process: Program = start(command, package, out)
 
     @property
     def output(self) -> str:
@@ -65,9 +66,13 @@ def stamp_of(message) -> tuple[int, int]:
 
 
 class Graph:
-    """A node that publishes all inputs of the graph and keeps all its outputs by stamp."""
+    """A node that publishes all inputs of the graph and keeps all its outputs by stamp.
 
-    def __init__(self):
+    start: how it starts executables, `interpreted` or `forked`.
+    """
+
+    def __init__(self, start=interpreted):
+        self._start = start
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self.node = rclpy.create_node("test", context=self._context)
@@ -123,7 +128,7 @@ class Graph:
         return heard
 
     def start(self, log: Path, package: str, name: str, *parameters, arguments=()) -> Executable:
-        self.processes.append(Executable(log, package, name, arguments, parameters))
+        self.processes.append(Executable(log, package, name, arguments, parameters, self._start))
         return self.processes[-1]
 
     def comes(self, condition, seconds: float) -> bool:
