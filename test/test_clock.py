@@ -103,6 +103,7 @@ def test_a_frame_that_comes_late_does_not_begin_the_average_anew(graph, solver):
         answered(graph, shot)
     values = {v.key: v.value for v in graph.state("solver: Average", "of all frames here").values}
     assert values["frames"] == "5"
+    graph.wait(lambda: shots[5].stamp in map(stamp_of, averaged), "for the average of the newest frame")
     assert stamp_of(averaged[-1]) == shots[5].stamp
 
 
@@ -138,7 +139,7 @@ def test_frames_and_tilts_from_the_future_are_refused(graph, solver):
     late(shot, time.time() + 100 - stamp_to_unix(shot.stars.header.stamp))
     graph.send(shot)
     assert graph.result(stamp_of(shot.stars))[0].status == Solution.BAD_INPUT
-    assert "a tilt is stamped" in solver.output
+    graph.wait(lambda: "a tilt is stamped" in solver.output, "for a word on the tilts")
     shot = shoot()
     late(shot, time.time() + 2.0 - stamp_to_unix(shot.stars.header.stamp))
     graph.send(shot)

@@ -2,12 +2,14 @@
 """Names that go with the node, and intrinsics from whoever sends them, whenever."""
 
 import pytest
+from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
 
 from starpos_interfaces.msg import Solution
 from starpos_testing.graph.shots import SOLVER, shoot
+from starpos_testing.patience import WAIT_S
 
 SERVICES = ("calibrate", "reset", "save_calibration", "self_calibrate", "solve")
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -39,6 +41,9 @@ def test_a_solver_that_starts_later_knows_the_camera_of_a_latched_camera_info(gr
     latched.publish(shot.info)
     run("starpos_solver", "solver", *SOLVER)
     graph.wait(lambda: graph.stars.get_subscription_count() and graph.tilt.get_subscription_count())
+    graph.wait(latched.get_subscription_count)
+    # else the stars could overtake it
+    assert latched.wait_for_all_acked(Duration(seconds=WAIT_S))
     # the stars alone come now
     for tilt in shot.tilts:
         graph.tilt.publish(tilt)

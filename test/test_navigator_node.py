@@ -150,12 +150,11 @@ def test_a_rovers_place_is_the_command_lines(graph, transforms, ears, record):
             break
     send_readings(ears, record, sent_s, SECONDS)
     stamp = stamp_of(reading(record.frames_s[-1]))
-    graph.wait(lambda: stamp in map(stamp_of, ears.odometry), "for the output of the last frame")
+    outputs = ears.fixes, ears.headings, ears.odometry
+    graph.wait(lambda: all(stamp in map(stamp_of, m) for m in outputs), "for the output of the last frame")
     assert value(graph, "Inputs", "refused") == "0"
 
-    fix, heading, odometry = (
-        next(m for m in heard if stamp_of(m) == stamp) for heard in (ears.fixes, ears.headings, ears.odometry)
-    )
+    fix, heading, odometry = (next(m for m in heard if stamp_of(m) == stamp) for heard in outputs)
     vessel = Vessel(
         vehicle="rover",
         model=INDUSTRIAL,
@@ -203,7 +202,8 @@ def test_without_stars_and_of_bad_readings_there_is_no_fix_but_a_sentence(graph,
     graph.state("navigator: Inputs", "an inertial reading is not later than the one before")
     assert value(graph, "Inputs", "refused") == "2"
     graph.state("navigator: Navigation", "no frame with stars yet")
-    assert ears.fixes and not ears.headings and not ears.odometry
+    graph.wait(lambda: ears.fixes, "for what there is without a fix")
+    assert not ears.headings and not ears.odometry
     assert all(m.status.status == NavSatStatus.STATUS_NO_FIX and np.isnan(m.latitude) for m in ears.fixes)
     assert graph.call(Trigger, "navigator/reset", Trigger.Request()).success
 

@@ -38,8 +38,10 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 def hear_all(listener):
     """Lists of the images, the intrinsics and the captures to come."""
-    topics = ((Image, "image_raw"), (CameraInfo, "camera_info"), (Capture, "capture"))
-    return [listener.hear(kind, f"camera/{name}") for kind, name in topics]
+    captures = listener.hear(Capture, "camera/capture")
+    infos = listener.hear(CameraInfo, "camera/camera_info")
+    # the last, as files are played from when somebody hears the images
+    return listener.hear(Image, "camera/image_raw"), infos, captures
 
 
 def test_what_a_cameras_own_clock_is_off_goes_with_its_frames(start, listener, tmp_path):

@@ -243,13 +243,13 @@ def test_closing_ends_a_capture_soon(make):
 
 
 def test_the_node_takes_frames_and_says_when_the_camera_is_gone(folder, start, listener, record_property):
-    images, captures = listener.hear(Image, "camera/image_raw"), listener.hear(Capture, "camera/capture")
+    captures, images = listener.hear(Capture, "camera/capture"), listener.hear(Image, "camera/image_raw")
     start("camera", "source:=gphoto2", "exposure:=0.1", "cadence:=1.0", "gphoto2.raw:=false")
     listener.wait(lambda: images)
     assert (images[0].encoding, images[0].height, images[0].width) == ("mono8", *GREY.shape)
     answer = listener.call(SetCapture, "camera/set_capture", SetCapture.Request(exposure=0.05))
     assert answer.success
-    listener.wait(lambda: captures[-1].exposure == pytest.approx(0.05))
+    listener.wait(lambda: captures and captures[-1].exposure == pytest.approx(0.05))
     folder.unplug()
     listener.wait_for_state("camera: Capture", ERROR, "gphoto2")
     folder.plug()

@@ -16,13 +16,14 @@ OK = 0
 
 
 def test_the_stars_of_each_frame_come_without_its_image(start, listener, folder):
-    stars = listener.hear(StarArray, "stars")
     infos, captures = (
         listener.hear(CameraInfo, "camera/camera_info"),
         listener.hear(Capture, "camera/capture"),
     )
+    # the last, as the files are played from when somebody hears the stars
+    stars = listener.hear(StarArray, "stars")
     node = start("camera_detector", f"files.path:={folder}", "cadence:=0.1", "focal_mm:=50")
-    listener.wait(lambda: len(stars) == 2)
+    listener.wait(lambda: len(stars) == len(infos) == len(captures) == 2)
     for name, message, info, capture in zip(("0", "2"), stars, infos, captures, strict=True):
         frame = read_frame(folder / f"{name}.fits")
         want, got = detect(frame).stars, message_to_stars(message)

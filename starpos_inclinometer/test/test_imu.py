@@ -69,6 +69,15 @@ def test_covariance_is_that_of_the_averages(tilt):
     assert claimed == pytest.approx(scatter, rel=0.2, abs=0.1 * np.sqrt(np.prod(np.diag(scatter))))
 
 
+@pytest.mark.parametrize("lean_deg", [0.2, 1.5])
+def test_the_vertical_axis_of_a_level_imu_errs_as_the_level_does(lean_deg):
+    rng = np.random.default_rng(5)
+    averages = [average(G * up(lean_deg, 0) + rng.normal(0, 0.01, (25, 3))) for _ in range(300)]
+    scatter = np.std([a.tilt()[2] for a in averages])
+    claimed = np.sqrt(np.mean([a.covariance()[2, 2] for a in averages]))
+    assert claimed == pytest.approx(scatter, rel=0.15)
+
+
 def test_stated_noise_counts_where_it_is_more_and_minus_one_is_none():
     rng = np.random.default_rng(1)
     forces = G * up(0, 0) + rng.normal(0, 0.02, (50, 3))

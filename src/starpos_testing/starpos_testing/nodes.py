@@ -17,7 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.exceptions import ParameterException
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor, TimeoutException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
@@ -50,6 +50,21 @@ def refusal(make: Callable[[], Node], *parameters: str) -> str:
     finally:
         rclpy.try_shutdown()
     raise AssertionError(f"taken: {parameters}")
+
+
+def take_all(executor: SingleThreadedExecutor) -> None:
+    """Take every message that has come: one that comes later was sent after what has been heard so far."""
+    taken = True
+    while taken:
+        taken = False
+        # it ends a round, in which each subscription gives one message
+        with suppress(TimeoutException):
+            while True:
+                handler, *_ = executor.wait_for_ready_callbacks(timeout_sec=0)
+                taken = True
+                handler()
+                # raises what a callback has raised
+                handler.result()
 
 
 class Listener:
@@ -86,6 +101,7 @@ class Listener:
 
     def wait_for_state(self, name: str, level: int, text: str = "") -> dict[str, str]:
         """Wait for the next diagnostic of a name with this level and this text in its sentence; returns its values."""
+        take_all(self._executor)
         self.states.pop(name, None)
 
         def come():

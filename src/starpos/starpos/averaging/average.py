@@ -13,10 +13,12 @@ from starpos.averaging.filter import PlaceFilter, Plane
 from starpos.averaging.poses import poses_of, slip_s
 from starpos.averaging.scatter import MAX_ROWS, Frames, Scatter, scatter_of
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
+from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.errors import FixError
 from starpos.fix.fix import Fix, PlaceFix
 from starpos.fix.terms import EACH_POSE, ErrorTerm
 from starpos.frozen import at_once
+from starpos.rotation import half_turn
 
 # sigma of a place in rad before anything is known of it
 ANYWHERE_RAD = np.pi
@@ -260,10 +262,33 @@ def average(fixes: Sequence[Fix]) -> Average:
     if whole.left_out >= whole.frames:
         raise FixError(
             f"of {whole.frames + whole.left_out} frames {whole.left_out} lie further from the others than their errors "
-            "allow, too many to say which are right: the frames are of several places, the mount or the "
-            "clock slipped, or the instrument turned and its stated A3 is wrong (--self-calibrate finds it)"
+            f"allow, too many to say which are right: {_why_apart(in_order)}"
         )
     return whole
+
+
+# sigma within which places that a frozen picture sets apart follow the sky's turn
+FOLLOWS_SIGMA = 5.0
+
+
+def _why_apart(in_order: Sequence[Fix]) -> str:
+    """Why the places of frames lie apart, for messages."""
+    times = np.array([f.utc_unix_s for f in in_order])
+    if not np.ptp(times):
+        return "all have the same time: the clock that stamps the frames stands still"
+    # seen again at a later time, a sky belongs to a place further west
+    west = np.array([f.longitude for f in in_order]) + ROTATION_RAD_S * (times - times[0])
+    away = [
+        (half_turn(east - west[0]) * math.cos(f.latitude), f.latitude - in_order[0].latitude)
+        for f, east in zip(in_order, west, strict=True)
+    ]
+    sigma = max(math.sqrt(np.trace(f.covariance[:2, :2])) for f in in_order) / EARTH_RADIUS_M
+    if np.abs(away).max() < FOLLOWS_SIGMA * sigma:
+        return "all show the same sky at different times: the picture stands still, or only its time is new"
+    return (
+        "the frames are of several places, the mount or the clock slipped, or the instrument turned and its stated A3 is "
+        "wrong (--self-calibrate finds it)"
+    )
 
 
 def _averaged(in_order: Sequence[Fix], frame_sigma: float) -> "Averager":

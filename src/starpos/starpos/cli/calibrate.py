@@ -491,7 +491,7 @@ def _about(found: FromSky) -> str:
     fit = found.fit
     lines = [
         f"{len(found.used)} frames, {len(fit.xy)} stars ({fit.rejected} left out): {fit.rms_px:.3f} px rms an axis, "
-        f"of the given camera, its scale fitted, {rms(fit.before):.3f} px"
+        f"{rms(fit.before):.3f} px by the given camera with its scale fitted alone"
     ]
     for name, value, sigma, told in zip(
         parameters(fit.camera), fit.values, fit.sigma, fit.determined, strict=True

@@ -94,7 +94,8 @@ def seen_at(args: argparse.Namespace, place: Place) -> Iterator[tuple[Frame | St
         if answer.at_place is None or answer.found is None:
             timed = answer.found is None or item.mid_unix_s
             no_time = f"{item.place}: no time of exposure: {why_no_time(item)}"
-            console.complain(answer.message if timed else no_time)
+            why = answer.message if item.place in answer.message else f"{item.place}: {answer.message}"
+            console.complain(why if timed else no_time)
             continue
         instrument = sight.instrument or work.instruments.of(item)
         assert instrument is not None

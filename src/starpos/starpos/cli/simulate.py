@@ -25,6 +25,12 @@ def run(args: argparse.Namespace) -> int:
         readout_s=args.readout,
         lens=args.lens,
     )
+    longest_s = scene.longest_s
+    if args.exposure >= longest_s and not args.stars_only:
+        console.complain(
+            f"the sky alone saturates these frames, they show no stars: give --exposure {longest_s / 3:.1g}, or "
+            "--stars-only (the simulated telescope has the same aperture at any focal length)"
+        )
     write_night(
         args.out,
         scene,

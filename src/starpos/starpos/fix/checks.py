@@ -134,6 +134,46 @@ def check_exposure(stars: Stars, camera: Camera, directions: np.ndarray) -> None
         )
 
 
+# Trails are of the sky's motion if their directions agree so well with it, rad, and with each other (the mean of unit
+# vectors). They show a longer exposure than stated if they are LONG times as long as wide, and their length is beyond
+# LONGER_THAN_STATED times the expected one and LONGER_PX.
+ALONG_SKY_RAD, IN_LINE, LONG = math.radians(5.0), 0.9, 1.4
+LONGER_THAN_STATED, LONGER_PX = 2.0, 2.0
+
+
+def check_trails(
+    stars: Stars, rows: np.ndarray, camera: Camera, attitude: np.ndarray, directions: np.ndarray
+) -> None:
+    """Raise FixError if stars are trails along the sky's motion that are far longer than the exposure stated.
+
+    rows (N,): of the stars with these directions (N, 3), GCRS, to which attitude (3, 3) turns the camera.
+    """
+    if stars.fwhm_px is None or not stars.exposure_s or len(rows) < MIN_STARS:
+        return
+    covariance = stars.covariance[rows]
+    # a list of stars has round errors
+    if not np.any(covariance[:, 0, 1]):
+        return
+    later = directions + ROTATION_RAD_S * np.cross([0.0, 0.0, 1.0], directions)
+    # px in a second
+    motion = camera.project(later @ attitude.T) - camera.project(directions @ attitude.T)
+    size, axes = np.linalg.eigh(covariance)
+    turned = np.angle(axes[:, 0, 1] + 1j * axes[:, 1, 1]) - np.angle(motion[:, 0] + 1j * motion[:, 1])
+    # a trail has no end that is its first
+    mean = complex(np.mean(np.exp(2j * turned)))
+    if abs(mean) < IN_LINE or abs(np.angle(mean)) > 2 * ALONG_SKY_RAD:
+        return
+    longer = math.sqrt(float(np.median(size[:, 1] / size[:, 0])))
+    trail_px = stars.fwhm_px * math.sqrt((longer - 1 / longer) / TRAIL_VARIANCE)
+    stated_px = stars.exposure_s * float(np.median(np.linalg.norm(motion, axis=1)))
+    if longer > LONG and trail_px > LONGER_THAN_STATED * stated_px + LONGER_PX:
+        raise FixError(
+            f"{stars.place}: its stars are trails of about {trail_px:.0f} px along the sky's motion, and an exposure of "
+            f"{stars.exposure_s:g} s of a camera at rest makes {stated_px:.1f} px: its exposure time is wrong (minutes?) "
+            "or it is a sum of exposures: give single frames with their own times"
+        )
+
+
 def _too_round(covariance: np.ndarray, area: float, trail_px: float) -> bool:
     """Whether the stars are far rounder than trails: their errors along and across are as their lengths and widths."""
     if not np.any(covariance[:, 0, 1]):

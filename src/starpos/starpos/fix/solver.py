@@ -28,6 +28,7 @@ from starpos.fix.checks import (
     check_above_horizon,
     check_exposure,
     check_risen,
+    check_trails,
     check_unmoved,
     set_stars,
     why_unidentified,
@@ -350,6 +351,7 @@ class Solver:
             use &= high_enough(directions_of(camera, stars)[found.star] @ up)
         places = catalogue.directions(found.catalogue[use], state.year, state.observer_au)
         check_exposure(stars, camera, places)
+        check_trails(stars, found.star[use], camera, found.attitude, places)
         return use, MatchedStars.of(stars, found, use, camera, catalogue, state.year, places)
 
     def attitude_at(self, stars: Stars, found: Identification, place: Place) -> AttitudeAtPlace:

@@ -51,7 +51,10 @@ COUNTS = ("STACKCNT", "NCOMBINE", "SNAPSHOT", "COADDS", "COADD", "NCOADD", "NCOA
 # the second of a stack's inputs (IRAF); the kind of a frame
 SECOND_INPUT, KIND = "IMCMB002", "IMAGETYP"
 STACKED = re.compile(r"\b(master *(light)?|stack(ed)?|integration|co-?add(ed)?|sum(med)?)\b", re.IGNORECASE)
+# when the file was written, some time after the exposure; a local time may seem earlier
+WRITTEN = "DATE"
 TIME_KEYS = (
+    WRITTEN,
     *START,
     *MIDDLE,
     *END,
@@ -295,6 +298,7 @@ def read_times(header: Mapping, comments: Mapping[str, str] = NO_COMMENTS) -> Ex
     try:
         off_s = _off_others_s(header, mid_unix_s, exposure_s or 0.0)
         _check_zone(header, mid_unix_s, exposure_s or 0.0)
+        _check_written(header, mid_unix_s)
     except TimeError as e:
         return Exposure(exposure_s=exposure_s, untimed=str(e))
     return Exposure(
@@ -370,7 +374,10 @@ def _other_unix_s(header: Mapping, key: str, near_unix_s: float) -> tuple[float,
         return None
     try:
         if isinstance(value, str) and (text := _as_today(value)) and ISO_TIME.fullmatch(text):
-            return _unix_s(*_tai(*_day_of(text, "utc"), "utc")), math.sqrt(3) * _rounding(text)
+            with warnings.catch_warnings():
+                # of years whose leap seconds are not known yet
+                warnings.simplefilter("ignore", erfa.ErfaWarning)
+                return _unix_s(*_tai(*_day_of(text, "utc"), "utc")), math.sqrt(3) * _rounding(text)
         if isinstance(value, str) and (clock := CLOCK.fullmatch(value.strip())):
             hours, minutes, seconds = clock.groups()
             of_day_s = int(hours) * 3600 + int(minutes) * 60 + float(seconds or 0)
@@ -411,6 +418,17 @@ def _check_zone(header: Mapping, mid_unix_s: float, exposure_s: float) -> None:
         f"its {zone} is {offset_h:+g} h, and no card shows whether DATE-OBS is UTC: add DATE-UTC or DATE-LOC, or take "
         f"{zone} away"
     )
+
+
+def _check_written(header: Mapping, mid_unix_s: float) -> None:
+    """TimeError if the file was written more than a day before the exposure."""
+    written = _other_unix_s(header, WRITTEN, mid_unix_s)
+    if written is not None and mid_unix_s - written[0] > DAY_S:
+        days = (mid_unix_s - written[0]) / DAY_S
+        raise TimeError(
+            f"its file was written (DATE) {days:.1f} days before its exposure: the clock was wrong, or day and month are "
+            "exchanged: correct the header, or take DATE away"
+        )
 
 
 def _offset_h(value: Any) -> float | None:

@@ -219,9 +219,9 @@ class MeanForce:
         forces = scatter * np.outer(grown, grown) + np.diag(np.where(stddev > 0, 0.0, self.variance))
         strength = np.linalg.norm(self.force)
         up = self.force / strength
-        # d asin(u) = du / cos, du = (1 - u u^T) df / |f|
-        slope = (np.eye(3) - np.outer(up, up)) / strength
-        slope /= np.sqrt(np.maximum(1 - up**2, 0.01))[:, None]
+        # d asin(u) = du / cos, du = (1 - u u^T) df / |f|: cos is the length of the row, which a vertical axis has not
+        across = np.eye(3) - np.outer(up, up)
+        slope = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9) / strength
         return slope @ forces @ slope.T / len(self.forces) + MIN_STDDEV_RAD**2 * np.eye(3)
 
 

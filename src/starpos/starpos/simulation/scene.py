@@ -96,6 +96,17 @@ class Scene:
         return full_turn(np.arctan2(forward[0], forward[1]))
 
     @property
+    def sky_e_s(self) -> float:
+        """Electrons per second that the sky gives to each pixel."""
+        optics = self.optics
+        return optics.zero_point_e_s * 10 ** (-0.4 * optics.sky_mag_arcsec2) * self.camera.scale_arcsec**2
+
+    @property
+    def longest_s(self) -> float:
+        """Exposure in s at which the sky alone saturates all pixels."""
+        return (self.optics.full_well_dn - self.optics.bias_dn) * self.optics.gain_e_dn / self.sky_e_s
+
+    @property
     def tilt(self) -> tuple[float, float]:
         """True theta_x, theta_y in rad."""
         up = self.instrument.mounting.a3 @ self.attitude[2]
@@ -152,8 +163,7 @@ def render(
 ) -> Frame:
     """A 16-bit frame: trailed Gaussian images integrated over pixels, sky, photon and read noise, clipping."""
     camera, optics = scene.camera, scene.optics
-    sky = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * optics.sky_mag_arcsec2) * camera.scale_arcsec**2
-    light = np.full(camera.height * camera.width, sky, np.float32)
+    light = np.full(camera.height * camera.width, scene.sky_e_s * exposure_s, np.float32)
     place, amount = _star_light(camera, optics, stars)
     np.add.at(light, place, amount)
     pixels = np.empty(len(light), np.uint16)

@@ -411,3 +411,30 @@ def test_the_heading_of_a_pose_that_nobody_believed_is_none(rng):
     assert np.all(np.abs(moved_m(a, field)) < 4 * np.sqrt(np.diag(a.covariance)[:2]))
     right = average(in_order(before + wrong + fixes(field, rng, [160.0])))
     assert right.poses == 2 and rotation.half_turn(right.heading - field.heading) != 0
+
+
+EAST_RAD_S = np.radians(15.041 / 3600)
+
+
+@pytest.mark.parametrize(
+    ("times_s", "west_s", "words"),
+    [
+        # a clock that stands, a picture that stands, places of their own
+        ((0, 0, 0, 0), (0, 300, 600, 900), "have the same time"),
+        ((0, 300, 600, 900), (0, 300, 600, 900), "same sky at different times"),
+        ((0, 5, 10, 15), (0, 5, 10, 15), "same sky at different times"),
+        ((0, 300, 600, 900), (0, -300, 250, 4000), "of several places"),
+    ],
+)
+def test_a_clock_or_a_picture_that_stands_still_is_named(rng, times_s, west_s, words):
+    one = fixes(SkyField(), rng, [40.0])[0]
+    made = [
+        replace(
+            read_at(one, UTC + t, 1e3 * k),
+            utc_unix_s=UTC + t,
+            longitude=rotation.half_turn(one.longitude - EAST_RAD_S * w),
+        )
+        for k, (t, w) in enumerate(zip(times_s, west_s, strict=True))
+    ]
+    with pytest.raises(FixError, match=words):
+        average(made)

@@ -3,6 +3,7 @@
 
 import csv
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -139,3 +140,21 @@ def test_a_camera_that_turns_is_no_camera_that_stands_still(run, lists, tmp_path
     assert status == 2 and "not of starpos" in err[-1]
     status, _, err = run("calibrate", "--watch", tmp_path / "none", *WIDE, *SITE)
     assert status == 2 and "cannot be read" in err[-1]
+
+
+def test_a_frame_of_another_size_in_a_watched_folder_is_named(run, lists, tmp_path):
+    first, *_ = sorted(Path(lists).rglob("*.csv"))
+    night = tmp_path / "night"
+    night.mkdir()
+    (night / "a.csv").write_text(first.read_text())
+    (night / "other.csv").write_text(first.read_text().replace('"NAXIS1": ', '"NAXIS1": 1', 1))
+    _, _, err = run("calibrate", "--watch", night, *WIDE, *AIR, *SITE)
+    assert any("other.csv: the frame is" in line for line in err)
+
+
+def test_a_sky_that_saturates_simulated_frames_is_told(run, tmp_path):
+    fisheye = ("--lens", "equidistant", "--focal-mm", 1.1, "--pixel-um", 3, "--size", 200, 200, "-n", 1)
+    status, _, err = run("simulate", tmp_path / "night", *fisheye)
+    assert status == 0 and "saturates" in err[0]
+    exposure = err[0].partition("give --exposure ")[2].partition(",")[0]
+    assert run("simulate", tmp_path / "night", *fisheye, "--exposure", exposure)[2] == []

@@ -246,3 +246,22 @@ def test_a_length_is_in_the_unit_that_the_header_states(cards, comment, exposure
 )
 def test_a_sum_of_exposures_has_no_time(cards):
     assert "stack" in read_times({**UTC, **cards}).untimed
+
+
+@pytest.mark.parametrize(
+    ("written", "days"),
+    [
+        # a clock that went back, GPS weeks that rolled over, day and month exchanged, a local date across a zone
+        ({"DATE": "2026-11-01T10:00:00"}, 1.3),
+        ({"DATE": "2007-03-19T18:00:10"}, 7168),
+        ({"DATE": "2026-02-11T18:00:10.5"}, 264),
+        ({"DATE": "2026-11-01T20:00:00"}, None),
+        ({"DATE": "2026-10-01"}, None),
+        ({"DATE": "2031-01-01T00:00:00"}, None),
+        ({"DATE": "unknown"}, None),
+    ],
+)
+def test_a_file_is_not_written_days_before_its_exposure(written, days):
+    read = read_times({**UTC, **written})
+    assert (read.mid_unix_s is None) == (days is not None)
+    assert days is None or f"written (DATE) {days:.1f} days before" in read.untimed

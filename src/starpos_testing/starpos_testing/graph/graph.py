@@ -17,6 +17,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image, Imu, NavSatFix
 
 from starpos_interfaces.msg import Capture, Solution, StarArray, Tilt
+from starpos_testing.nodes import take_all
 from starpos_testing.patience import WAIT_S
 
 # Until another photograph is sent: nodes that have not met lose it.
@@ -209,6 +210,7 @@ class Graph:
 
     def state(self, name: str, text: str) -> object:
         """Wait for the next diagnostic of a name with this text in its sentence."""
+        take_all(self._executor)
         self.diagnostics.pop(name, None)
 
         def found():
