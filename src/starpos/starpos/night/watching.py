@@ -202,7 +202,9 @@ def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
         if nights:
             # for each size of the wander its own mean
             before = np.linalg.inv(sums[0])
-            off = rotation.to_vector(pose.optics.rotation @ first.T) - np.einsum("sij,sj->si", before, sums[1])
+            off = rotation.to_vector(pose.optics.rotation @ first.T) - np.einsum(
+                "sij,sj->si", before, sums[1]
+            )
             total = each + before
             chi2 = np.einsum("si,sij,sj->s", off, np.linalg.inv(total), off)
             weight = np.exp(log_weight - log_weight.max())
@@ -217,7 +219,10 @@ def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
         if alarm or not nights:
             first, nights, sums = pose.optics.rotation, 0, (0 * sums[0], 0 * sums[1])
         information = np.linalg.inv(each)
-        sums = sums[0] + information, sums[1] + information @ rotation.to_vector(pose.optics.rotation @ first.T)
+        sums = (
+            sums[0] + information,
+            sums[1] + information @ rotation.to_vector(pose.optics.rotation @ first.T),
+        )
         nights += 1
     return tuple(found)
 
