@@ -92,7 +92,7 @@ def test_a_circle(sense, rng):
 
 
 def test_a_clock_that_errs_by_the_direction_and_readings_that_scatter(rng):
-    # the azimuth's error by a late clock differs from direction to direction, and at two of them it is none
+    # the azimuth's error by a late clock differs from direction to direction, and at two of them it is zero
     reading, own = np.radians(np.arange(45.0, 360, 45)), np.geomspace(1, 30, 7) * ARCSEC
     by_clock = np.radians(0.25) * (0.8 - 1.1 * np.cos(reading))[:, None]
     z = []
