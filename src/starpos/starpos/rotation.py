@@ -81,9 +81,11 @@ def shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     )
 
 
-def mean_rotation(rotations: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) nearest to all of rotations (N, 3, 3), by least squares."""
-    return best_rotation(np.tile(np.eye(3), (len(rotations), 1)), np.concatenate(rotations.swapaxes(1, 2)))
+def mean_rotation(rotations: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
+    """The rotation (3, 3) nearest to all of rotations (N, 3, 3), by least squares; weight (N,), or 1."""
+    axes = np.tile(np.eye(3), (len(rotations), 1))
+    each = None if weight is None else np.repeat(weight, 3)
+    return best_rotation(axes, np.concatenate(rotations.swapaxes(1, 2)), each)
 
 
 def to_small_vector(r: np.ndarray) -> np.ndarray:

@@ -63,6 +63,8 @@ def poses_of(fixes: Sequence[Fix]) -> np.ndarray:
     return poses
 
 
+# the variance of a frame without errors of its own
+TINY_RAD2 = 1e-18
 # a frame of a camera at rest gets beyond it once in 1e6 frames
 TURN_SIGMAS = 5.5
 
@@ -79,9 +81,12 @@ class MeanAttitude:
 
 
 def mean_attitude(attitudes: Sequence[AttitudeAtPlace]) -> MeanAttitude:
-    """The mean of one or more frames; FixError if the camera turned between them."""
+    """The weighted mean of one or more frames; FixError if the camera turned between them."""
     cameras = np.array([a.camera.rotation for a in attitudes])
-    mean = rotation.mean_rotation(cameras)
+    # by what each frame does not share with the others: few stars, as through dew, count for little
+    weight = np.array([1 / max(np.trace(a.optics.unshared), TINY_RAD2) for a in attitudes])
+    weight /= weight.sum()
+    mean = rotation.mean_rotation(cameras, weight)
     for attitude, camera in zip(attitudes, cameras, strict=True):
         off = rotation.to_vector(camera @ mean.T)
         if off @ np.linalg.solve(attitude.camera.covariance, off) > TURN_SIGMAS**2:
@@ -92,24 +97,25 @@ def mean_attitude(attitudes: Sequence[AttitudeAtPlace]) -> MeanAttitude:
     return MeanAttitude(
         utc_unix_s=float(np.mean([a.utc_unix_s for a in attitudes])),
         frames=len(attitudes),
-        plumb=_mean([a.plumb for a in attitudes]),
-        ellipsoid=_mean([a.ellipsoid for a in attitudes]),
-        optics=_mean([a.optics for a in attitudes]),
+        plumb=_mean([a.plumb for a in attitudes], weight),
+        ellipsoid=_mean([a.ellipsoid for a in attitudes], weight),
+        optics=_mean([a.optics for a in attitudes], weight),
     )
 
 
-def _mean(links: Sequence[Attitude]) -> Attitude:
-    """The mean of attitudes whose budgets name the same sources in the same order."""
-    mean = rotation.mean_rotation(np.array([link.rotation for link in links]))
-    return link_attitude(mean, tuple(map(_mean_term, zip(*(k.terms for k in links), strict=True))))
+def _mean(links: Sequence[Attitude], weight: np.ndarray) -> Attitude:
+    """The mean of attitudes whose budgets name the same sources in the same order; the weights add up to 1."""
+    mean = rotation.mean_rotation(np.array([link.rotation for link in links]), weight)
+    return link_attitude(
+        mean, tuple(_mean_term(terms, weight) for terms in zip(*(k.terms for k in links), strict=True))
+    )
 
 
-def _mean_term(terms: Sequence[ErrorTerm]) -> ErrorTerm:
+def _mean_term(terms: Sequence[ErrorTerm], weight: np.ndarray) -> ErrorTerm:
     """One source's term: errors that are new in each frame average away, those that are shared do not."""
     first = terms[0]
     if first.shared is None:
-        covariance = np.sum([t.covariance for t in terms], axis=0) / len(terms) ** 2
+        covariance = np.tensordot(weight**2, [t.covariance for t in terms], 1)
         return ErrorTerm(first.name, symmetric_root(covariance), origin=first.origin)
-    return ErrorTerm(
-        first.name, np.mean([t.factor for t in terms], axis=0), shared=first.shared, origin=first.origin
-    )
+    shared = np.tensordot(weight, [t.factor for t in terms], 1)
+    return ErrorTerm(first.name, shared, shared=first.shared, origin=first.origin)

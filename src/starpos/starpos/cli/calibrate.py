@@ -298,9 +298,10 @@ def _watch(args: argparse.Namespace) -> int:
         if args.horizon is not None:
             stars.append(horizon.expected(sight, camera, catalogue.load_catalogue()))
     nights = kept(night_poses(answers, site.longitude))
-    for night in nights:
+    for k, night in enumerate(nights):
         values = watch_output.values_of(night)
         console.tell(args, values, watch_output.line_of(values))
+        console.complain(watch_output.dimmed_of(nights[: k + 1]))
         if night.alarm:
             console.complain(watch_output.alarm_of(night))
     if args.page is not None:

@@ -5,6 +5,7 @@ import argparse
 import csv
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,9 @@ from starpos.cli import console, inputs, options
 from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, InstrumentError
 from starpos.files import open_regular
+from starpos.fix.attitude import Attitude, heading_row
 from starpos.fix.directions import CircleOrientation, circle_orientation, horizontal, mount_axis
 from starpos.fix.heading import AttitudeAtPlace
-from starpos.fix.terms import total_covariance
 from starpos.units import ARCSEC
 
 READING = "azimuth_deg"
@@ -85,19 +86,21 @@ def _circle(
         raise FixError(
             f"no frame with a heading has a reading in {args.readings}: check the names in its column file"
         )
-    at = [horizontal(a.optics, np.array(axis)) for _, a, _ in there]
-    azimuth, sigma = (np.concatenate([getattr(h, k) for h in at]) for k in ("azimuth", "sigma_azimuth"))
-    shared = float(np.mean([_shared(a) for _, a, _ in there]))
-    own = np.sqrt(np.maximum(sigma**2 - shared**2, (0.1 * ARCSEC) ** 2))
-    found = circle_orientation(azimuth, own, shared, np.radians([r for *_, r in there]))
+    optics, along = [a.optics for _, a, _ in there], np.array(axis)
+    at = [horizontal(replace(o, covariance=o.unshared), along) for o in optics]
+    azimuth, own = (np.concatenate([getattr(h, k) for h in at]) for k in ("azimuth", "sigma_azimuth"))
+    shared = np.array([_shared(o, along) for o in optics])
+    found = circle_orientation(
+        azimuth, np.maximum(own, 0.1 * ARCSEC), shared, np.radians([r for *_, r in there])
+    )
     _print_circle(args, found, [path for path, *_ in there])
     return 0
 
 
-def _shared(seen: AttitudeAtPlace) -> float:
-    """The error in rad of azimuths that all frames of a place share."""
-    terms = tuple(t for t in seen.optics.terms if t.common)
-    return math.sqrt(total_covariance(terms)[5, 5]) if terms else 0.0
+def _shared(optics: Attitude, axis: np.ndarray) -> np.ndarray:
+    """The errors (m,) in rad of an axis's azimuth by the sources that all frames of a place share."""
+    row = heading_row((optics.rotation @ axis)[:, None])
+    return np.concatenate([math.sqrt(t.variance) * row @ t.factor[3:] for t in optics.terms if t.common])
 
 
 def _print_circle(args: argparse.Namespace, found: CircleOrientation, names: Sequence[str]) -> None:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
+import numpy as np
+
 from starpos.files import save
 from starpos.night.watching import Kept
 from starpos.report.html import document, wide_table
@@ -21,12 +23,15 @@ COLUMNS = {
     "sigma_arcsec": ("1 sigma", "{:.1f}"),
     "focal_px": ("focal length, px", "{:.3f}"),
     "limit_mag": ("limit, V", "{:.1f}"),
+    "worst_limit_mag": ("worst frame", "{:.1f}"),
     "extinction": ("extinction, mag per air mass", "{:.2f}"),
     "extinction_sigma": ("1 sigma", "{:.2f}"),
     "sky_mag": ("sky, V per square arcsec", "{:.2f}"),
     "alarm": ("", "{}"),
 }
 TITLE = "A camera that stands still"
+# a limit that is brighter by more is said in a sentence
+DIMMED_MAG = 1.0
 # of the page's picture, px
 WIDTH, HEIGHT = 800, 120
 
@@ -44,6 +49,7 @@ def values_of(night: Kept) -> dict:
         "turned_arcsec": (night.turned / ARCSEC).tolist(),
         "focal_px": pose.focal_px,
         "limit_mag": pose.limit_mag,
+        "worst_limit_mag": pose.worst_limit_mag,
         "extinction": pose.extinction,
         "extinction_sigma": pose.extinction_sigma,
         "sky_mag": pose.sky_mag,
@@ -60,7 +66,7 @@ def line_of(values: dict) -> str:
     )
     return (
         "{night}: {frames} frames, {stars} stars, moved by {moved_arcsec:.1f} +- {sigma_arcsec:.1f} arcsec, focal length "
-        "{focal_px:.3f} px, limit V {limit_mag:.1f}" + air + sky
+        "{focal_px:.3f} px, limit V {limit_mag:.1f} (worst frame {worst_limit_mag:.1f})" + air + sky
     ).format(**values)
 
 
@@ -69,6 +75,17 @@ def alarm_of(night: Kept) -> str:
     return (
         f"{night.pose.day}: the camera has moved by {night.moved_arcsec:.0f} arcsec against the {night.nights} nights "
         "before: later nights are compared with this one; calibrate it again"
+    )
+
+
+def dimmed_of(nights: Sequence[Kept]) -> str:
+    """Say that a frame of the last of the nights shows only brighter stars than the nights do; '' if it does not."""
+    pose, usual = nights[-1].pose, float(np.median([n.pose.limit_mag for n in nights]))
+    if not usual - pose.worst_limit_mag > DIMMED_MAG:
+        return ""
+    return (
+        f"{pose.day}: at {utc_text(pose.worst_unix_s)} the faintest stars were of V {pose.worst_limit_mag:.1f}, "
+        f"{usual - pose.worst_limit_mag:.1f} mag brighter than usual: clouds, haze, dew on the glass, or moonlight"
     )
 
 

@@ -45,6 +45,12 @@ class Attitude:
         )
 
     @property
+    def unshared(self) -> np.ndarray:
+        """Covariance (3, 3) of the errors that other frames do not share; the whole one without a budget."""
+        terms = [t.covariance[3:, 3:] for t in self.terms if not t.common]
+        return np.sum([np.zeros((3, 3)), *terms], axis=0) if self.terms else self.covariance
+
+    @property
     def covariance_about_own(self) -> np.ndarray:
         """Covariance (3, 3) in rad2 of the small rotation about the axes of `of`."""
         return self.rotation.T @ self.covariance @ self.rotation

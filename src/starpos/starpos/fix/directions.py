@@ -2,7 +2,7 @@
 """Where directions that are fixed to a camera point at a known place, and the axis about which a mount turns it."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from starpos import rotation
 from starpos.errors import FixError
 from starpos.fix.attitude import Attitude
-from starpos.fix.terms import ErrorTerm
 from starpos.frozen import at_once
 
 # of the camera C
@@ -125,8 +124,7 @@ def mount_axis(attitudes: Sequence[Attitude]) -> MountAxis:
         for a in attitudes:
             seen = a.rotation @ m
             slope = np.cross(seen, of_n)
-            own = _covariance(t for t in a.terms if not t.common) if a.terms else a.covariance
-            weight = np.linalg.inv(slope @ own @ slope.T)
+            weight = np.linalg.inv(slope @ a.unshared @ slope.T)
             design = np.hstack([np.eye(2), -of_n @ a.rotation @ of_m.T])
             off = of_n @ (seen - n)
             left += design.T @ weight @ design
@@ -143,16 +141,11 @@ def mount_axis(attitudes: Sequence[Attitude]) -> MountAxis:
     free = 2 * len(attitudes) - 4
     covariance = np.linalg.inv(left)[:2, :2] * (max(1.0, chi2 / free) if free else 1.0)
     slope = np.cross(n, _basis(n[None])[0])
-    shared = [_covariance(t for t in a.terms if t.common) for a in attitudes]
+    shared = [a.covariance - a.unshared for a in attitudes]
     covariance = covariance + slope @ np.mean(shared, axis=0) @ slope.T
     sign = 1.0 if n[2] >= 0 else -1.0
     flip = np.diag([-1.0, 1.0]) if sign < 0 else np.eye(2)
     return MountAxis(direction=sign * n, covariance=flip @ covariance @ flip, in_camera=sign * m, rest=rest)
-
-
-def _covariance(terms: Iterable[ErrorTerm]) -> np.ndarray:
-    """Covariance (3, 3) in rad2 of an attitude's small rotation by these sources."""
-    return np.sum([np.zeros((3, 3)), *(t.covariance[3:, 3:] for t in terms)], axis=0)
 
 
 @at_once
@@ -171,22 +164,28 @@ class CircleOrientation:
 
 
 def circle_orientation(
-    azimuth: np.ndarray, own: np.ndarray, shared: float, reading: np.ndarray
+    azimuth: np.ndarray, own: np.ndarray, shared: np.ndarray, reading: np.ndarray
 ) -> CircleOrientation:
     """The orientation of a circle from azimuths (N,) of one direction fixed to what it turns, and its readings (N,), rad.
 
-    own (N,): errors of the azimuths that differ from frame to frame.  shared: the error that is common to all.
+    own (N,): errors of the azimuths that differ from frame to frame.  shared (N, m): errors by m sources that are common
+    to all.  What the readings scatter beyond these errors is their own.
     """
 
     def by(sense: int) -> CircleOrientation:
         each, weight = azimuth - sense * reading, 1 / np.square(own)
         around = rotation.half_turns(each - each[0])
+        free, off = len(each) - 1, around - np.average(around, weights=weight)
+        # the variance of the readings that makes chi2 what it has to be (DerSimonian and Laird 1986)
+        more = max(weight @ off**2 - free, 0.0) / max(weight.sum() - weight @ weight / weight.sum(), 1e-99)
+        weight = 1 / (np.square(own) + more)
         zero = float(np.average(around, weights=weight))
-        rest = around - zero
-        scatter = weight @ np.square(rest) / max(len(rest) - 1, 1)
-        sigma = math.sqrt(max(1.0, scatter) / weight.sum() + shared**2)
+        common = np.average(shared, axis=0, weights=weight)
         return CircleOrientation(
-            zero=rotation.full_turn(float(each[0]) + zero), sigma=sigma, sense=sense, rest=rest
+            zero=rotation.full_turn(float(each[0]) + zero),
+            sigma=math.sqrt(1 / weight.sum() + common @ common),
+            sense=sense,
+            rest=around - zero,
         )
 
     both = [by(1), by(-1)]

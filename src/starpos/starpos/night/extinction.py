@@ -59,7 +59,7 @@ def light_of(stars: Stars, solution: Solution, camera: Camera) -> Light:
 def extinction(lights: Sequence[Light]) -> tuple[float, float]:
     """Extinction in mag per air mass and its error, by frames of one camera and night; NaN where they do not show it.
 
-    The vignetting, a polynomial of the radius, is fitted too.
+    The vignetting, a polynomial of the radius, is fitted too, and how much each frame is dimmed as a whole, as by dew.
     """
     v, measured, mass, off = (
         np.concatenate([getattr(f, name) for f in lights]) for name in ("v", "measured", "air_mass", "off")
@@ -67,12 +67,16 @@ def extinction(lights: Sequence[Light]) -> tuple[float, float]:
     unknown = np.nan, np.nan
     if len(v) < FEWEST:
         return unknown
-    bright = v < np.percentile(v, 95) - SURELY_DETECTED_MAG
+    frame = np.repeat(range(len(lights)), [len(light.v) for light in lights])
+    bright = np.concatenate(
+        [light.v < np.percentile(light.v, 95) - SURELY_DETECTED_MAG for light in lights if len(light.v)]
+    )
     patch = np.unique(np.floor(off[bright] * PATCHES), axis=0, return_inverse=True)[1].ravel()
     if bright.sum() < FEWEST or patch.max() < FEWEST_PATCHES:
         return unknown
     r2 = np.square(off[bright]).sum(1)
-    design = np.stack([mass[bright], v[bright], np.ones(len(r2)), r2, r2**2], -1)
+    zero = frame[bright, None] == np.unique(frame[bright])
+    design = np.column_stack([mass[bright], v[bright], r2, r2**2, zero])
     target, weight = measured[bright], np.ones(len(r2))
     for _ in range(ROUNDS):
         found = np.linalg.lstsq(design * weight[:, None], target * weight, rcond=None)[0]

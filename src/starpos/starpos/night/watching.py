@@ -42,7 +42,8 @@ class NightPose:
 
     day: the date of its evening by local mean time.  stars: number of identified ones.
     optics: C in east, north, up.  focal_px: mean of the frames, on the axis.
-    limit_mag: V of the faintest stars, by the extinction, where it is known, as if at the zenith.
+    limit_mag: V of the faintest stars of the median frame, by the extinction, where it is known, as if at the zenith.
+    worst_limit_mag, worst_unix_s: of the frame with the brightest limit.
     extinction, extinction_sigma: mag per air mass.  sky_mag: V of the sky per square arcsec.  NaN: not known.
     """
 
@@ -53,6 +54,8 @@ class NightPose:
     optics: Attitude
     focal_px: float
     limit_mag: float
+    worst_limit_mag: float
+    worst_unix_s: float
     extinction: float
     extinction_sigma: float
     sky_mag: float
@@ -159,8 +162,8 @@ def _pose(day: str, answers: Sequence[Answer]) -> NightPose:
     mean = mean_attitude([_at(a) for a in answers])
     lights = [a.light for a in answers]
     k, sigma = extinction(lights)
-    dimmed = [np.nan_to_num(k) * (light.air_mass - 1) for light in lights]
-    known = np.concatenate([light.v + more for light, more in zip(lights, dimmed, strict=True)])
+    limits = np.array([_limit(light, np.nan_to_num(k)) for light in lights])
+    seen, worst = limits[np.isfinite(limits)], int(np.argmin(np.nan_to_num(limits, nan=np.inf)))
     sky = np.array([a.sky_mag for a in answers if np.isfinite(a.sky_mag)])
     return NightPose(
         day=day,
@@ -169,45 +172,58 @@ def _pose(day: str, answers: Sequence[Answer]) -> NightPose:
         stars=sum(len(a.solution.names) for a in answers),
         optics=mean.optics,
         focal_px=float(np.mean([a.focal_px for a in answers])),
-        limit_mag=float(np.percentile(known, LIMIT_PERCENTILE)) if len(known) else np.nan,
+        limit_mag=float(np.median(seen)) if len(seen) else np.nan,
+        worst_limit_mag=float(limits[worst]),
+        worst_unix_s=_at(answers[worst]).utc_unix_s,
         extinction=k,
         extinction_sigma=sigma,
         sky_mag=float(np.median(sky)) if len(sky) else np.nan,
     )
 
 
+def _limit(light: Light, extinction: float) -> float:
+    """V of the faintest stars of a frame as if at the zenith; NaN without stars."""
+    if not len(light.v):
+        return np.nan
+    return float(np.percentile(light.v + extinction * (light.air_mass - 1), LIMIT_PERCENTILE))
+
+
 def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
-    """Each pose against the mean of those before it; after an alarm it is against those since.
+    """Each pose against the weighted mean of those before it; after an alarm it is against those since.
 
     The sizes of the wander from night to night are weighed by what the nights have shown of them so far.
     """
-    before: list[NightPose] = []
     log_weight = -RARER * np.log(np.maximum(WANDERS_RAD / USUAL_RAD, 1))
-    found = []
+    found: list[Kept] = []
+    first, nights, sums = np.eye(3), 0, (np.zeros((len(WANDERS_RAD), 3, 3)), np.zeros((len(WANDERS_RAD), 3)))
     for pose in poses:
         turned, covariance, alarm = np.zeros(3), pose.own, False
-        if before:
-            mean = rotation.mean_rotation(np.array([p.optics.rotation for p in before]))
-            turned = rotation.to_vector(pose.optics.rotation @ mean.T)
-            more = 1 + 1 / len(before)
-            each = (pose.own + np.eye(3) * WANDERS_RAD[:, None, None] ** 2) * more
-            chi2 = (
-                turned @ np.linalg.solve(each, np.broadcast_to(turned, (len(each), 3))[..., None])[..., 0].T
+        each = pose.own + np.eye(3) * WANDERS_RAD[:, None, None] ** 2
+        if nights:
+            # for each size of the wander its own mean
+            before = np.linalg.inv(sums[0])
+            off = rotation.to_vector(pose.optics.rotation @ first.T) - np.einsum(
+                "sij,sj->si", before, sums[1]
             )
+            total = each + before
+            chi2 = np.einsum("si,sij,sj->s", off, np.linalg.inv(total), off)
             weight = np.exp(log_weight - log_weight.max())
             weight /= weight.sum()
-            covariance = np.tensordot(weight, each, 1)
+            turned, covariance = weight @ off, np.tensordot(weight, total, 1)
             alarm = bool(weight @ [_chance(x) for x in chi2] < ALARM_CHANCE)
+            if not alarm:
+                log_weight -= (chi2 + np.linalg.slogdet(total)[1]) / 2
         found.append(
-            Kept(
-                pose=pose, nights=len(before), turned=turned, sigma=np.sqrt(np.diag(covariance)), alarm=alarm
-            )
+            Kept(pose=pose, nights=nights, turned=turned, sigma=np.sqrt(np.diag(covariance)), alarm=alarm)
         )
-        if alarm:
-            before = []
-        elif before:
-            log_weight -= (chi2 + np.linalg.slogdet(each)[1]) / 2
-        before.append(pose)
+        if alarm or not nights:
+            first, nights, sums = pose.optics.rotation, 0, (0 * sums[0], 0 * sums[1])
+        information = np.linalg.inv(each)
+        sums = (
+            sums[0] + information,
+            sums[1] + information @ rotation.to_vector(pose.optics.rotation @ first.T),
+        )
+        nights += 1
     return tuple(found)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from starpos import rotation
+from starpos.averaging.poses import mean_attitude
 from starpos.earth.orientation import EarthOrientation, earth_orientation, earth_state
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
@@ -278,3 +279,20 @@ class TestOfAFrame:
         timeless = replace(stars, mid_unix_s=None)
         where = Place.by_gravity(scene.site.latitude_deg, scene.site.longitude_deg, EXACT)
         assert placed(solver, timeless, solver.identify(timeless), where).at_place is None
+
+
+def test_frames_through_dew_do_not_turn_the_mean_of_clear_ones(rng):
+    z2 = []
+    for _ in range(30):
+        seen = []
+        for k in range(9):
+            stars, link = ring(200.0, 70.0, 20.0, number=24 if k < 4 else 6)
+            sigma = 0.05 if k < 4 else 3.0
+            errors = np.tile(np.eye(2) * sigma**2, (len(stars.xy), 1, 1))
+            off = rng.normal(0, sigma, stars.xy.shape)
+            seen.append(attitude_of(replace(stars, xy=stars.xy + off, covariance_px2=errors)))
+        mean = mean_attitude(seen).plumb
+        off = rotation.to_vector(mean.rotation @ link.T)
+        z2.append(off @ np.linalg.solve(mean.covariance, off) / 3)
+        assert np.linalg.norm(off) < 20 * ARCSEC
+    assert 0.6 < np.mean(z2) < 1.6

@@ -85,7 +85,19 @@ def test_a_circle(sense, rng):
     z = []
     for _ in range(100):
         azimuth = (np.radians(123.0) + sense * reading + rng.normal(0, own, 4)) % (2 * np.pi)
-        found = circle_orientation(azimuth, np.full(4, own), 0.0, reading)
+        found = circle_orientation(azimuth, np.full(4, own), np.zeros((4, 1)), reading)
         assert found.sense == sense
         z.append((found.zero - np.radians(123.0)) / found.sigma)
     assert 0.6 < np.std(z) < 1.15
+
+
+def test_a_clock_that_errs_by_the_direction_and_readings_that_scatter(rng):
+    # the azimuth's error by a late clock differs from direction to direction, and at two of them it is zero
+    reading, own = np.radians(np.arange(45.0, 360, 45)), np.geomspace(1, 30, 7) * ARCSEC
+    by_clock = np.radians(0.25) * (0.8 - 1.1 * np.cos(reading))[:, None]
+    z = []
+    for _ in range(300):
+        off = by_clock[:, 0] * rng.normal() + rng.normal(0, own) + rng.normal(0, np.radians(0.2), 7)
+        found = circle_orientation(reading + off, own, by_clock, reading)
+        z.append(rotation.half_turn(found.zero) / found.sigma)
+    assert 0.8 < np.std(z) < 1.1

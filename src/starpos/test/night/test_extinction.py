@@ -34,6 +34,19 @@ def test_the_extinction_lies_within_its_error(blotches):
     assert len(pulls) > 30 and 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.4 and np.abs(pulls).max() < 4.5
 
 
+def test_dew_that_grows_dims_each_frame_otherwise():
+    pulls = []
+    for k in range(20):
+        frames = night(np.random.default_rng(k), count=6000)
+        dewed = [
+            Light(*(part[f.v < 5.5 - dim] for part in (f.v, f.measured + dim, f.air_mass, f.off)))
+            for f, dim in zip(frames, (0.0, 0.6, 1.2, 2.0), strict=True)
+        ]
+        found, sigma = extinction(dewed)
+        pulls.append((found - EXTINCTION) / sigma)
+    assert np.isfinite(pulls).sum() > 15 and np.nanmax(np.abs(pulls)) < 4
+
+
 def test_where_the_stars_do_not_tell_it_it_is_unknown(rng):
     # without low stars, few stars, brightness that is stretched as pictures have it
     assert np.isnan(extinction(night(rng, lowest_deg=40))).all()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from starpos import rotation
+from starpos.cli import watch_output
 from starpos.fix.attitude import Attitude
 from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Frame, Stars
@@ -17,20 +18,20 @@ from starpos.units import ARCSEC
 FRAMES, SHARED = 4 * ARCSEC, 100 * ARCSEC
 
 
-def month(rng, wander, knock=None, nights=30):
-    """Poses with errors of their own, a large one that all share, a wander; a knock before one night."""
+def month(rng, wander, knock=None, nights=30, dewed=()):
+    """Poses with errors of their own, a large one that all share, a wander; a knock before one night; nights with dew."""
     pose, common = rotation.from_vector([1.0, 0.4, 2.0]), rotation.from_vector(rng.normal(0, SHARED, 3))
-    factors = ("centroids", FRAMES, None), ("lens", SHARED, ALWAYS)
-    terms = tuple(
-        ErrorTerm(name, np.vstack([np.zeros((3, 3)), np.eye(3) * sigma]), shared=kind)
-        for name, sigma, kind in factors
-    )
     made = []
     for k in range(nights):
+        own = FRAMES * (50 if k in dewed else 1)
+        terms = tuple(
+            ErrorTerm(name, np.vstack([np.zeros((3, 3)), np.eye(3) * sigma]), shared=kind)
+            for name, sigma, kind in (("centroids", own, None), ("lens", SHARED, ALWAYS))
+        )
         if k == knock:
             axis = rng.normal(0, 1, 3)
             pose = rotation.from_vector(np.radians(0.05) * axis / np.linalg.norm(axis)) @ pose
-        off = rotation.from_vector(rng.normal(0, np.hypot(FRAMES, wander), 3))
+        off = rotation.from_vector(rng.normal(0, np.hypot(own, wander), 3))
         optics = Attitude(common @ off @ pose, np.eye(3), of="camera", into="ENU", terms=terms)
         made.append(
             NightPose(
@@ -41,6 +42,8 @@ def month(rng, wander, knock=None, nights=30):
                 optics=optics,
                 focal_px=1,
                 limit_mag=5,
+                worst_limit_mag=2 if k in dewed else 4.5,
+                worst_unix_s=k,
                 extinction=np.nan,
                 extinction_sigma=np.nan,
                 sky_mag=21,
@@ -60,6 +63,18 @@ def test_a_knock_is_found_the_same_night_and_none_is_invented(wander, rng):
             assert found[knock].moved_arcsec == pytest.approx(180, abs=5 * found[knock].sigma_arcsec)
     # neither too small nor too large
     assert 0.8 < np.std(sigmas) < 1.2
+
+
+def test_nights_with_dew_hardly_count_and_a_sentence_says_so(rng):
+    for dewed in ((0, 1, 5), (3, 4, 8)):
+        found = kept(month(rng, 2 * ARCSEC, nights=12, dewed=dewed))
+        clear = [night for k, night in enumerate(found) if k > 8 and k not in dewed]
+        assert not any(night.alarm for night in found)
+        assert max(night.moved_arcsec for night in clear) < 20
+        assert max(np.abs(night.turned / night.sigma).max() for night in clear) < 4
+        said = [watch_output.dimmed_of(found[: k + 1]) for k in range(12)]
+        assert [k for k in range(12) if said[k]] == list(dewed)
+        assert "V 2.0, 3.0 mag brighter than usual" in said[dewed[1]]
 
 
 def test_a_post_that_wanders_far_is_no_alarm():
