@@ -48,12 +48,12 @@ def graph(domain):
 
 @pytest.fixture
 def run(graph, tmp_path):
-    """Start an executable that ends with the test: run(package, name, *parameters, arguments=())."""
+    """Start an executable that ends with the test: run(package, name, *parameters, arguments=(), start=None)."""
     mine = []
 
-    def run(package, name, *parameters, arguments=()):
+    def run(package, name, *parameters, arguments=(), start=None):
         log = tmp_path / f"{len(mine)}-{name}.log"
-        mine.append(graph.start(log, package, name, *parameters, arguments=arguments))
+        mine.append(graph.start(log, package, name, *parameters, arguments=arguments, start=start))
         return mine[-1]
 
     yield run

@@ -145,7 +145,7 @@ class Process:
         options = [word for p in parameters for word in ("-p", p)]
         command = [sys.executable, "-c", program, "--ros-args", "-r", f"__ns:={namespace}", *options]
         self._open = ExitStack()
-        self._out = self._open.enter_context(tempfile.TemporaryFile("w+"))
+        self._out = self._open.enter_context(tempfile.TemporaryFile("w+"))  # noqa: SIM115
         self._process = forked(command, module.split(".")[0], self._out)
 
     def end(self, *signals) -> tuple[int, str]:

@@ -68,7 +68,7 @@ def stamp_of(message) -> tuple[int, int]:
 class Graph:
     """A node that publishes all inputs of the graph and keeps all its outputs by stamp.
 
-    start: how it starts executables, `interpreted` or `forked`.
+    start: how it starts executables that are not started otherwise, `interpreted` or `forked`.
     """
 
     def __init__(self, start=interpreted):
@@ -127,8 +127,9 @@ class Graph:
         self.node.create_subscription(kind, topic, heard.append, qos)
         return heard
 
-    def start(self, log: Path, package: str, name: str, *parameters, arguments=()) -> Executable:
-        self.processes.append(Executable(log, package, name, arguments, parameters, self._start))
+    def start(self, log: Path, package: str, name: str, *parameters, arguments=(), start=None) -> Executable:
+        made = Executable(log, package, name, arguments, parameters, start or self._start)
+        self.processes.append(made)
         return self.processes[-1]
 
     def comes(self, condition, seconds: float) -> bool:
