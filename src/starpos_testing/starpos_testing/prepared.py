@@ -174,7 +174,7 @@ def serve(number: int, parent: int) -> list[str]:
     # Ctrl-C is for tests and nodes
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     asked = socket.socket(fileno=number)
-    # by the file that tells the end of a child: the child, and the pipe for its exit status
+    # by the file that shows the end of a child: the child, and the pipe for its exit status
     children: dict[int, tuple[int, int]] = {}
     with selectors.DefaultSelector() as events:
         events.register(asked, selectors.EVENT_READ)
@@ -185,7 +185,7 @@ def serve(number: int, parent: int) -> list[str]:
                     pid, status = children.pop(key.fd)
                     ended = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
                     os.close(key.fd)
-                    # nobody may want to know it any more
+                    # the tests may have ended
                     with suppress(BrokenPipeError):
                         os.write(status, str(ended).encode())
                     os.close(status)
