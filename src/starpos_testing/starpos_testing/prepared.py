@@ -48,7 +48,7 @@ PR_SET_PDEATHSIG = 1
 MAX_BYTES = 2**17
 
 
-class Program(Protocol):
+class Child(Protocol):
     """A program that runs: as much of subprocess.Popen as tests use."""
 
     pid: int
@@ -60,12 +60,12 @@ class Program(Protocol):
     def kill(self) -> None: ...
 
 
-def interpreted(command: list[str], package: str, out: IO) -> Program:
+def interpreted(command: list[str], package: str, out: IO) -> Child:
     """Start a program in an interpreter of its own; what it says goes to a file."""
     return subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
 
 
-def forked(command: list[str], package: str, out: IO) -> Program:
+def forked(command: list[str], package: str, out: IO) -> Child:
     """Start a program of a package as `interpreted` does, from the process that has its imports."""
     server = _server()
     start = server.start if server.variables == _variables() else interpreted

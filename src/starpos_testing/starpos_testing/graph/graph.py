@@ -19,7 +19,7 @@ from sensor_msgs.msg import CameraInfo, Image, Imu, NavSatFix
 from starpos_interfaces.msg import Capture, Solution, StarArray, Tilt
 from starpos_testing.nodes import take_all
 from starpos_testing.patience import WAIT_S
-from starpos_testing.prepared import Program, interpreted
+from starpos_testing.prepared import Child, interpreted
 
 # Until another photograph is sent: nodes that have not met lose it.
 AGAIN_S = 2.0
@@ -37,7 +37,7 @@ class Executable:
         command = [executable(package, name), *arguments, *(["--ros-args", *options] if options else [])]
         self.name, self.log = name, log
         with log.open("w") as out:
-            self.process: Program = start(command, package, out)
+            self.process: Child = start(command, package, out)
 
     @property
     def output(self) -> str:
