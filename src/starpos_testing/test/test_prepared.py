@@ -18,7 +18,7 @@ PACKAGE = "starpos_inclinometer"
 SAYS = (
     "import os, sys, threading; print(sys.argv, os.getcwd(), threading.active_count(), __name__); sys.exit(3)"
 )
-WAITS = "import signal; print('here', flush=True); signal.pause()"
+WAITS = "import time; print('here', flush=True)\nwhile True: time.sleep(0.1)"
 FAILS = "import sys; print('before'); sys.stderr.write('said '); raise KeyError('defect')"
 # starts a program and says which
 TESTS = f"""
