@@ -73,7 +73,9 @@ def forked(command: list[str], package: str, out: IO) -> Child:
 
 
 def _variables() -> dict[str, str]:
-    return {name: value for name, value in os.environ.items() if name != IGNORED}
+    """The variables that have to be the same: not how many threads libraries have, which a tool sets for its process."""
+    variables = {name: value for name, value in os.environ.items() if name != IGNORED}
+    return {name: v for name, v in variables.items() if name not in ONE_THREAD and "_NUM_THREADS" not in name}
 
 
 class Forked:
