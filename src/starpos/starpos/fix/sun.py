@@ -23,6 +23,7 @@ from starpos.fix.attitude import ANY_TURN, CameraAttitude
 from starpos.fix.budget import Circumstances, sky_terms, tilt_terms
 from starpos.fix.checks import MIN_DEG, check_unmoved
 from starpos.fix.circle import MIN_SINE, Circle, circle_along
+from starpos.fix.directions import axes_across
 from starpos.fix.fix import Fix, levelled_fix
 from starpos.fix.glows import Glow
 from starpos.fix.heading import AttitudeAtPlace, attitudes_at, zenith_moved
@@ -373,7 +374,7 @@ def _two_body_fix(looks: list[_Look], tilt: Tilt) -> Fix:
         raise PlaceError(
             f"{shot.stars.place}: its two bright discs are {seen_deg:.2f} deg apart, and {names} {true_deg:.2f}"
         )
-    across = [_across(v) for v in there]
+    across = axes_across(there)
     turned = [np.cross(v, c) for v, c in zip(there, across, strict=True)]
     spread = np.linalg.inv(sum(t.T @ t / v for t, v in zip(turned, variances, strict=True)))
     by = [spread @ t.T / v for t, v in zip(turned, variances, strict=True)]
@@ -393,12 +394,6 @@ def _two_body_fix(looks: list[_Look], tilt: Tilt) -> Fix:
     )
     check_unmoved(fix, shot.solver.instrument)
     return fix
-
-
-def _across(direction: np.ndarray) -> np.ndarray:
-    """Unit vectors (2, 3) across a direction (3,): sideways and upwards."""
-    along = np.array([-direction[1], direction[0], 0.0]) / math.hypot(direction[0], direction[1])
-    return np.stack([along, np.cross(direction, along)])
 
 
 def _on_circle(as_sun: _Look, tilt: Tilt) -> Solution:
@@ -509,7 +504,7 @@ class _Above:
             )
         about = shot.about
         bent, raised = about.atmosphere.raised(true)
-        components, local = _across(bent), g @ look.ray
+        components, local = axes_across(bent[None])[0], g @ look.ray
         g = rotation.about_axis(2, math.atan2(bent[1], bent[0]) - math.atan2(local[1], local[0])) @ g
         turn = np.cross(bent, components)
         terms = (
