@@ -132,11 +132,6 @@ class Directions:
     def covariance(self) -> np.ndarray:
         return np.sum(list(self.sources.values()), axis=0)
 
-    @staticmethod
-    def east_north(zenith: np.ndarray) -> np.ndarray:
-        """East and north (2, 3) in ITRS at a zenith (3,), along which the derivatives of `residual` are."""
-        return _enu(zenith)[:2]
-
     @property
     def wide(self) -> bool:
         """Whether A3 is known too badly for a linear error."""
@@ -166,7 +161,7 @@ class Directions:
             measured = np.array([c.zenith_distance for c in every])
         nearer = np.array([c.parallax for c in every])[:, None] * ground_m(zenith) / EQUATOR_RADIUS_M
         v = rotation.normalised(np.array([c.itrs for c in every]) - nearer + station_velocity(zenith))
-        axes = _enu(zenith)
+        axes = enu_at(zenith)
         local = v @ axes.T
         sine = np.hypot(local[:, 0], local[:, 1])
         slope = -local[:, :2] / np.maximum(sine, 1e-12)[:, None]
@@ -330,7 +325,7 @@ def _refined(part: Directions, weight: np.ndarray, zenith: np.ndarray) -> _Answe
         if np.linalg.norm(step) < SETTLED:
             return _Answer(zenith, gain, float(left @ weight @ left))
         step *= min(1.0, 0.3 / np.linalg.norm(step))
-        zenith = rotation.normalised(zenith + step @ _enu(zenith)[:2])
+        zenith = rotation.normalised(zenith + step @ enu_at(zenith)[:2])
     return None
 
 
@@ -373,11 +368,6 @@ def _average(part: Directions, answer: _Answer, frames: int) -> Average:
     )
 
 
-def f_quantile(free: int, share: float) -> float:
-    """Quantile of the F distribution with 2 and `free` degrees of freedom; to import scipy.special takes 80 ms."""
-    return free / 2 * float((1 - share) ** (-2 / free) - 1)
-
-
 def excess(chi2: float, free: int) -> float:
     """Variance beyond the stated one, as a share of it, for residuals that scatter more than stated.
 
@@ -385,11 +375,12 @@ def excess(chi2: float, free: int) -> float:
     """
     if free < 1 or chi2 <= free:
         return 0.0
-    # the ellipse that holds a share WITHIN, over the ellipse of a known scatter
-    wide = f_quantile(max(free, 2), WITHIN) / -np.log(1 - WITHIN)
-    return float((chi2 / free - 1) * wide)
+    beyond, free = chi2 / free - 1, max(free, 2)
+    # the ellipse that holds a share WITHIN, by the F distribution with 2 and `free`, over the ellipse of a known scatter
+    wide = free / 2 * ((1 - WITHIN) ** (-2 / free) - 1) / -np.log(1 - WITHIN)
+    return float(beyond * wide)
 
 
-def _enu(zenith: np.ndarray) -> np.ndarray:
+def enu_at(zenith: np.ndarray) -> np.ndarray:
     """East, north and up (3, 3) in ITRS at a zenith (3,)."""
     return enu_axes(*place_of_zenith(zenith))

@@ -13,6 +13,7 @@ from starpos.averaging.altitudes import (
     MIN_JUDGED,
     OUTLIER_SIGMA,
     Directions,
+    enu_at,
     excess,
     starts,
     usual_sigma,
@@ -30,8 +31,9 @@ from starpos.units import ARCSEC
 REWEIGHTED = 20
 # rounds of refractions and errors that follow A3, until it moves by less (rad)
 RELINEARISED, SAME_AXIS_RAD = 8, 1e-7
-MAX_STEP_RAD = 0.3
-AXIS_ROUNDS, SETTLED_CHI2, FIRST_DAMPING, LAST_DAMPING = 80, 1e-6, 1e-3, 1e9
+SETTLED = 1e-12
+# residual in sigma of an axis that some frames cannot have
+IMPOSSIBLE = 1e6
 # an axis that is known better than this (rad) is known
 MIN_RAD = 1e-9
 # number of zeniths that are tried, the ones that fit best at first
@@ -180,7 +182,7 @@ def _contradicting(best: FoundAxis, given: Calibration, site: Place | None) -> s
     off, a3, zenith = best.off, best.a3, best.zenith
     for _ in range(REWEIGHTED):
         problem.doubt = np.maximum(off - 1, 0.0)
-        robust = problem.descended(a3, zenith)
+        robust = problem.solved(a3, zenith)
         if robust is None:
             return set()
         off, a3, zenith = robust.off, robust.a3, robust.zenith
@@ -237,89 +239,66 @@ class _Problem:
         self.stated = np.sum([c for name, c in self.part.sources.items() if name != OF_A3], axis=0)
         self.doubt: np.ndarray | float = 0.0
 
-    def at(self, a3: np.ndarray, zenith: np.ndarray) -> "_Normal | None":
-        """Linearise at an A3 and a zenith; None for an axis that some frames cannot have."""
-        axis = a3 @ self.ray
-        seen, stated = _seen(self.up, axis), self.stated
-        if np.sin(seen).min() < MIN_SINE or np.cos(seen).min() < MIN_COS_ZENITH:
-            return None
-        left, of_zenith = self.part.residual(zenith, seen + self.bent)
-        across = np.linalg.svd(axis[None])[2][1:]
-        slope = self.part.mean(self.up @ across.T / np.sin(seen)[:, None])
-        if self.zenith_sigma is None:
-            slope = np.hstack([slope, of_zenith])
-        else:
-            stated = stated + self.zenith_sigma**2 * of_zenith @ of_zenith.T
-        # how far the axis is from where it was given, in units of what is known of it
-        prior = np.linalg.inv(_known(self.given, axis, across))
-        off = across @ (axis - self.given.a3 @ self.ray)
-        doubted = np.diag(np.diag(stated) * self.doubt)
-        weighted = np.linalg.solve(stated + doubted, np.column_stack([left, slope]))
-        matrix, pull = slope.T @ weighted[:, 1:], slope.T @ weighted[:, 0]
-        matrix[:2, :2] += prior
-        pull[:2] += prior @ off
-        return _Normal(
-            a3=a3,
-            zenith=zenith,
-            across=across,
-            matrix=matrix,
-            pull=pull,
-            prior=prior,
-            chi2=float(left @ weighted[:, 0] + off @ prior @ off),
-            off=np.abs(left) / np.sqrt(np.diag(stated)),
-        )
-
-    def descended(self, a3: np.ndarray, zenith: np.ndarray) -> "_Normal | None":
-        """The least chi-square near an A3 and a zenith, by Levenberg and Marquardt's method.
+    def solved(self, a3: np.ndarray, zenith: np.ndarray) -> FoundAxis | None:
+        """The least chi-square near an A3 and a zenith; None for an axis that some frames cannot have.
 
         Axis and zenith together lie in a narrow, bent valley where the sensor leans about alike in all directions.
         """
-        damping, now, ray = FIRST_DAMPING, self.at(a3, zenith), self.ray
-        axis = rotation.normalised(a3 @ ray)
-        if now is None:
+        from scipy.optimize import least_squares
+
+        start = rotation.normalised(a3 @ self.ray)
+        across, along = np.linalg.svd(start[None])[2][1:], enu_at(zenith)[:2]
+        stated, known = self.stated, _known(self.given, start, across)
+        if self.zenith_sigma is not None:
+            of_zenith = self.part.residual(zenith, _seen(self.up, start) + self.bent)[1]
+            stated = stated + self.zenith_sigma**2 * of_zenith @ of_zenith.T
+        doubted = np.diag(np.diag(stated) * self.doubt)
+        white, prior = (np.linalg.inv(np.linalg.cholesky(c)) for c in (stated + doubted, known))
+
+        def moved(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return rotation.normalised(start + x[:2] @ across), rotation.normalised(
+                zenith + x[2:] @ along[: len(x) - 2]
+            )
+
+        def left(x: np.ndarray) -> np.ndarray:
+            axis, there = moved(x)
+            return self.part.residual(there, _seen(self.up, axis) + self.bent)[0]
+
+        def residual(x: np.ndarray) -> np.ndarray:
+            seen = _seen(self.up, moved(x)[0])
+            if np.sin(seen).min() < MIN_SINE or np.cos(seen).min() < MIN_COS_ZENITH:
+                return np.full(len(white) + 2, IMPOSSIBLE)
+            # how far the axis is from where it was given, in units of what is known of it
+            off = across @ (moved(x)[0] - self.given.a3 @ self.ray)
+            return np.append(white @ left(x), prior @ off)
+
+        origin = np.zeros(2 if self.zenith_sigma is not None else 4)
+        if residual(origin)[0] == IMPOSSIBLE:
             return None
-        for _ in range(AXIS_ROUNDS):
-            damped = now.matrix + damping * np.diag(np.diag(now.matrix))
-            step = -np.linalg.solve(damped, now.pull)
-            step /= max(1.0, float(np.abs(step).max()) / MAX_STEP_RAD)
-            moved = rotation.normalised(now.a3 @ ray + step[:2] @ now.across)
-            # each from the first, because products of many turns grow apart from a rotation
-            tried_a3, there = rotation.shortest_turn(axis, moved) @ a3, now.zenith
-            if self.zenith_sigma is None:
-                there = rotation.normalised(there + step[2:] @ Directions.east_north(there))
-            tried = self.at(tried_a3, there)
-            if tried is None or tried.chi2 > now.chi2:
-                damping *= 10
-                if damping > LAST_DAMPING:
-                    break
-                continue
-            gain, now, damping = now.chi2 - tried.chi2, tried, damping / 10
-            if gain < SETTLED_CHI2:
-                break
-        return now
+        found = least_squares(residual, origin, method="lm", x_scale="jac", xtol=SETTLED, ftol=SETTLED)
+        axis, there = moved(found.x)
+        spread = np.linalg.inv(found.jac.T @ found.jac)
+        # by the elevations rather than what was known
+        told = len(origin) - float(np.trace(np.linalg.solve(known, spread[:2, :2])))
+        chi2, number = 2 * float(found.cost), len(stated)
+        scatter2 = excess(chi2, int(number - np.floor(told + 1e-6)))
+        return FoundAxis(
+            a3=rotation.shortest_turn(start, axis) @ a3,
+            ray=self.ray,
+            zenith=there,
+            across=across,
+            covariance=spread[:2, :2] * (1 + scatter2),
+            scatter2=scatter2,
+            directions=number,
+            off=np.abs(left(found.x)) / np.sqrt(np.diag(stated)),
+            chi2=chi2,
+            circles=self.circles,
+        )
 
 
 def _seen(up: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """Apparent zenith distances (N,) of an axis (3,) in S, where up (N, 3) is there."""
     return np.arctan2(np.linalg.norm(np.cross(up, axis), axis=1), up @ axis)
-
-
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class _Normal:
-    """The least-squares problem at an A3 (3, 3) and a zenith (3,): its unknowns are the axis, and perhaps the zenith.
-
-    off (D,): residuals in stated sigmas.
-    """
-
-    a3: np.ndarray
-    zenith: np.ndarray
-    across: np.ndarray
-    matrix: np.ndarray
-    pull: np.ndarray
-    prior: np.ndarray
-    chi2: float
-    off: np.ndarray
 
 
 def _fitted(
@@ -333,27 +312,10 @@ def _fitted(
         if len(circles) < frames:
             return None
         frames, before = len(circles), a3
-        problem = _Problem(a3, circles, given, ray, zenith_sigma)
-        now = problem.descended(a3, zenith)
+        now = _Problem(a3, circles, given, ray, zenith_sigma).solved(a3, zenith)
         if now is None:
             return None
         a3, zenith = now.a3, now.zenith
         if np.linalg.norm((a3 - before) @ ray) < SAME_AXIS_RAD:
             break
-    assert now is not None
-    spread = np.linalg.inv(now.matrix)
-    told = len(spread) - float(np.trace(now.prior @ spread[:2, :2]))
-    number = len(problem.part.circles)
-    scatter2 = excess(now.chi2, int(number - np.floor(told + 1e-6)))
-    return FoundAxis(
-        a3=a3,
-        ray=ray,
-        zenith=zenith,
-        across=now.across,
-        covariance=spread[:2, :2] * (1 + scatter2),
-        scatter2=scatter2,
-        directions=number,
-        off=now.off,
-        chi2=now.chi2,
-        circles=circles,
-    )
+    return now
