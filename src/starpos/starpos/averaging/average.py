@@ -344,19 +344,16 @@ class _Track:
     @classmethod
     def before(cls, f: Fix, frame_sigma: float) -> "_Track":
         """A track without a fix, ready for fixes like `f`; frame_sigma (rad): their scatter beyond their budgets."""
-        place_filter = PlaceFilter.before(_with_scatter(f, frame_sigma))
-        return cls(
-            place_filter=place_filter, pose=f, claim=Claim(frame_sigma=frame_sigma), began_unix_s=f.utc_unix_s
+        place_filter, claim = (
+            PlaceFilter.before(_with_scatter(f, frame_sigma)),
+            Claim(frame_sigma=frame_sigma),
         )
+        return cls(place_filter=place_filter, pose=f, claim=claim, began_unix_s=f.utc_unix_s)
 
     def rival(self, f: Fix) -> "_Track":
         """A track without a fix that knows the errors of this one, but not its place."""
-        return _Track(
-            place_filter=self.place_filter.elsewhere(self._scattered(f)),
-            pose=self.pose,
-            claim=Claim(frame_sigma=self.claim.frame_sigma),
-            began_unix_s=f.utc_unix_s,
-        )
+        elsewhere = self.place_filter.elsewhere(self._scattered(f))
+        return replace(_Track.before(f, self.claim.frame_sigma), place_filter=elsewhere, pose=self.pose)
 
     def touched(self, f: Fix) -> "_Track":
         """The track after somebody touched the camera; `f` is the first fix since."""

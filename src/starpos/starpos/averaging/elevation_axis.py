@@ -27,8 +27,6 @@ from starpos.instrument.instrument import UNKNOWN_ARCSEC, Calibration
 from starpos.instrument.mounting import angles_at
 from starpos.units import ARCSEC
 
-# rounds of weights that follow the residuals
-REWEIGHTED = 20
 # rounds of refractions and errors that follow A3, until it moves by less (rad)
 RELINEARISED, SAME_AXIS_RAD = 8, 1e-7
 SETTLED = 1e-12
@@ -159,8 +157,7 @@ def _axes(circles_of: CirclesOf, given: Calibration, ray: np.ndarray, site: Plac
         first = Directions.of(sorted(circles_of(given.a3), key=lambda c: c.utc_unix_s))
         tried = sorted(starts(first), key=lambda z: float(np.median(np.abs(first.residual(z)[0]))))
         zeniths = [*_round(first), *tried[:TRIED]]
-    sigma = None if site is None else site.plumb_stddev
-    found = [_fitted(circles_of, given, ray, zenith, sigma) for zenith in zeniths]
+    found = [_fitted(circles_of, given, ray, zenith, site) for zenith in zeniths]
     if not any(found):
         raise FixError(
             "the elevations do not determine A3: check the tilts, the clock and that nothing was moved"
@@ -172,24 +169,18 @@ def _contradicting(best: FoundAxis, given: Calibration, site: Place | None) -> s
     """Times of the frames whose directions contradict the others; none if they are too few to judge, or too many.
 
     They are judged from the least sum of residuals instead of squares, which a blunder does not pull towards itself
-    (Bloomfield and Steiger, Least Absolute Deviations, 1983), by weights that follow the residuals.
+    (Bloomfield and Steiger, Least Absolute Deviations, 1983).
     """
     number, free = best.directions, best.directions - (2 if site is not None else 4)
     if number < MIN_JUDGED or best.off.max() < OUTLIER_SIGMA:
         return set()
-    sigma = None if site is None else site.plumb_stddev
-    problem = _Problem(best.a3, best.circles, given, best.ray, sigma)
-    off, a3, zenith = best.off, best.a3, best.zenith
-    for _ in range(REWEIGHTED):
-        problem.doubt = np.maximum(off - 1, 0.0)
-        robust = problem.solved(a3, zenith)
-        if robust is None:
-            return set()
-        off, a3, zenith = robust.off, robust.a3, robust.zenith
-    wrong = np.flatnonzero(off > OUTLIER_SIGMA * max(usual_sigma(off, free), 1.0))
+    robust = _solved(best.a3, best.zenith, best.circles, given, best.ray, site, robust=True)
+    if robust is None:
+        return set()
+    wrong = np.flatnonzero(robust.off > OUTLIER_SIGMA * max(usual_sigma(robust.off, free), 1.0))
     if len(wrong) > MAX_OUTLIERS * number:
         return set()
-    return {c.utc_unix_s for k in wrong for c in problem.part.circles[k]}
+    return {c.utc_unix_s for k in wrong for c in Directions.of(best.circles).circles[k]}
 
 
 def _known(given: Calibration, axis: np.ndarray, across: np.ndarray) -> np.ndarray:
@@ -218,82 +209,74 @@ def _slope(circle: Circle, across: np.ndarray) -> np.ndarray:
     return -(across @ circle.up) / max(np.sin(circle.zenith_distance), 1e-9)
 
 
-class _Problem:
-    """The circles about an A3 (3, 3), of which refraction and errors stay as they are while the axis moves a little.
+def _solved(
+    a3: np.ndarray,
+    zenith: np.ndarray,
+    circles: Sequence[Circle],
+    given: Calibration,
+    ray: np.ndarray,
+    site: Place | None,
+    robust: bool = False,
+) -> FoundAxis | None:
+    """The least chi-square near an A3 (3, 3) and a zenith; None for an axis that some frames cannot have.
 
-    stated (D, D): without A3's error; doubt (D,): variance beyond it, as a share; bent (N,): the refractions.
-    zenith_sigma: None if the zenith is unknown.
+    circles: about that A3; their refraction and errors stay as they are while the axis moves a little.
+    robust: by the sum of the residuals rather than of their squares.
+    Axis and zenith together lie in a narrow, bent valley where the sensor leans about alike in all directions.
     """
+    from scipy.optimize import least_squares
 
-    def __init__(
-        self,
-        a3: np.ndarray,
-        circles: Sequence[Circle],
-        given: Calibration,
-        ray: np.ndarray,
-        zenith_sigma: float | None,
-    ) -> None:
-        self.circles, self.given, self.ray, self.zenith_sigma = circles, given, ray, zenith_sigma
-        self.part, self.up = Directions.of(circles), np.array([c.up for c in circles])
-        self.bent = np.array([c.zenith_distance for c in circles]) - _seen(self.up, a3 @ ray)
-        self.stated = np.sum([c for name, c in self.part.sources.items() if name != OF_A3], axis=0)
-        self.doubt: np.ndarray | float = 0.0
+    part, up = Directions.of(circles), np.array([c.up for c in circles])
+    start = rotation.normalised(a3 @ ray)
+    bent = np.array([c.zenith_distance for c in circles]) - _seen(up, start)
+    across, along = np.linalg.svd(start[None])[2][1:], enu_at(zenith)[:2]
+    stated, known = part.without(OF_A3), _known(given, start, across)
+    if site is not None:
+        of_zenith = part.residual(zenith, _seen(up, start) + bent)[1]
+        stated = stated + site.plumb_stddev**2 * of_zenith @ of_zenith.T
+    sigma = np.sqrt(np.diag(stated))
+    each = np.diag(np.diag(stated)) if robust else stated
+    white, prior = (np.linalg.inv(np.linalg.cholesky(c)) for c in (each, known))
 
-    def solved(self, a3: np.ndarray, zenith: np.ndarray) -> FoundAxis | None:
-        """The least chi-square near an A3 and a zenith; None for an axis that some frames cannot have.
+    def moved(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        there = zenith + x[2:] @ along[: len(x) - 2]
+        return rotation.normalised(start + x[:2] @ across), rotation.normalised(there)
 
-        Axis and zenith together lie in a narrow, bent valley where the sensor leans about alike in all directions.
-        """
-        from scipy.optimize import least_squares
+    def left(x: np.ndarray) -> np.ndarray:
+        axis, there = moved(x)
+        return part.residual(there, _seen(up, axis) + bent)[0]
 
-        start = rotation.normalised(a3 @ self.ray)
-        across, along = np.linalg.svd(start[None])[2][1:], enu_at(zenith)[:2]
-        stated, known = self.stated, _known(self.given, start, across)
-        if self.zenith_sigma is not None:
-            of_zenith = self.part.residual(zenith, _seen(self.up, start) + self.bent)[1]
-            stated = stated + self.zenith_sigma**2 * of_zenith @ of_zenith.T
-        doubted = np.diag(np.diag(stated) * self.doubt)
-        white, prior = (np.linalg.inv(np.linalg.cholesky(c)) for c in (stated + doubted, known))
+    def residual(x: np.ndarray) -> np.ndarray:
+        seen = _seen(up, moved(x)[0])
+        if np.sin(seen).min() < MIN_SINE or np.cos(seen).min() < MIN_COS_ZENITH:
+            return np.full(len(white) + 2, IMPOSSIBLE)
+        # how far the axis is from where it was given, in units of what is known of it
+        off = across @ (moved(x)[0] - given.a3 @ ray)
+        return np.append(white @ left(x), prior @ off)
 
-        def moved(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return rotation.normalised(start + x[:2] @ across), rotation.normalised(
-                zenith + x[2:] @ along[: len(x) - 2]
-            )
-
-        def left(x: np.ndarray) -> np.ndarray:
-            axis, there = moved(x)
-            return self.part.residual(there, _seen(self.up, axis) + self.bent)[0]
-
-        def residual(x: np.ndarray) -> np.ndarray:
-            seen = _seen(self.up, moved(x)[0])
-            if np.sin(seen).min() < MIN_SINE or np.cos(seen).min() < MIN_COS_ZENITH:
-                return np.full(len(white) + 2, IMPOSSIBLE)
-            # how far the axis is from where it was given, in units of what is known of it
-            off = across @ (moved(x)[0] - self.given.a3 @ self.ray)
-            return np.append(white @ left(x), prior @ off)
-
-        origin = np.zeros(2 if self.zenith_sigma is not None else 4)
-        if residual(origin)[0] == IMPOSSIBLE:
-            return None
-        found = least_squares(residual, origin, method="lm", x_scale="jac", xtol=SETTLED, ftol=SETTLED)
-        axis, there = moved(found.x)
-        spread = np.linalg.inv(found.jac.T @ found.jac)
-        # by the elevations rather than what was known
-        told = len(origin) - float(np.trace(np.linalg.solve(known, spread[:2, :2])))
-        chi2, number = 2 * float(found.cost), len(stated)
-        scatter2 = excess(chi2, int(number - np.floor(told + 1e-6)))
-        return FoundAxis(
-            a3=rotation.shortest_turn(start, axis) @ a3,
-            ray=self.ray,
-            zenith=there,
-            across=across,
-            covariance=spread[:2, :2] * (1 + scatter2),
-            scatter2=scatter2,
-            directions=number,
-            off=np.abs(left(found.x)) / np.sqrt(np.diag(stated)),
-            chi2=chi2,
-            circles=self.circles,
-        )
+    origin = np.zeros(4 if site is None else 2)
+    if residual(origin)[0] == IMPOSSIBLE:
+        return None
+    how = {"method": "trf", "loss": "soft_l1"} if robust else {"method": "lm"}
+    found = least_squares(residual, origin, x_scale="jac", xtol=SETTLED, ftol=SETTLED, **how)
+    axis, there = moved(found.x)
+    spread = np.linalg.inv(found.jac.T @ found.jac)
+    # by the elevations rather than what was known
+    told = len(origin) - float(np.trace(np.linalg.solve(known, spread[:2, :2])))
+    chi2, number = 2 * float(found.cost), len(stated)
+    scatter2 = excess(chi2, int(number - np.floor(told + 1e-6)))
+    return FoundAxis(
+        a3=rotation.shortest_turn(start, axis) @ a3,
+        ray=ray,
+        zenith=there,
+        across=across,
+        covariance=spread[:2, :2] * (1 + scatter2),
+        scatter2=scatter2,
+        directions=number,
+        off=np.abs(left(found.x)) / sigma,
+        chi2=chi2,
+        circles=circles,
+    )
 
 
 def _seen(up: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -302,7 +285,7 @@ def _seen(up: np.ndarray, axis: np.ndarray) -> np.ndarray:
 
 
 def _fitted(
-    circles_of: CirclesOf, given: Calibration, ray: np.ndarray, zenith: np.ndarray, zenith_sigma: float | None
+    circles_of: CirclesOf, given: Calibration, ray: np.ndarray, zenith: np.ndarray, site: Place | None
 ) -> FoundAxis | None:
     """The answer near a zenith; None if it does not converge."""
     a3, frames, now = given.a3, 0, None
@@ -312,7 +295,7 @@ def _fitted(
         if len(circles) < frames:
             return None
         frames, before = len(circles), a3
-        now = _Problem(a3, circles, given, ray, zenith_sigma).solved(a3, zenith)
+        now = _solved(a3, zenith, circles, given, ray, site)
         if now is None:
             return None
         a3, zenith = now.a3, now.zenith

@@ -545,11 +545,6 @@ class _Frame:
         # others were checked when they became known
         if attitude is None:
             self.check_risen(stars, found, camera)
-        return self._sighting(stars, seen, found, camera)
-
-    def _sighting(
-        self, stars: Stars, seen: np.ndarray, found: Identification, camera: Camera
-    ) -> CameraSighting:
         use = sound_matches(stars, found, ENOUGH_SOUND)
         level = self._level(found.attitude)
         if level is not None and fisheye.is_wide(camera):

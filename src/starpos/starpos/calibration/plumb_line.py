@@ -438,9 +438,7 @@ def hang(
     angles, starts = _turns(mean, start) if turn_sigma > NARROW_TURN else (np.zeros(1), start[None])
     found = fits(readings, starts, turn_sigma, angles, zenith, min(max(zenith_sigma, 1e-12), np.pi))
     best = min(found, key=attrgetter("cost"))
-    if found[0].cost < best.cost + AS_GOOD:
-        best = found[0]
-    return best
+    return found[0] if found[0].cost < best.cost + AS_GOOD else best
 
 
 def typical(left: np.ndarray, parameters: int) -> float:

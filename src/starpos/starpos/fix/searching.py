@@ -133,9 +133,8 @@ def _by_stars(solver: Solver, question: Question) -> Sight:
 
 def identify_every_way(solver: Solver, question: Question) -> Sight:
     """Identify a frame; its stars that identified it, or the given ones with the first answer if none did."""
-    first = Sight(question.stars, solver.identify(question.stars, question.predicted))
-    # most frames are: what all other ways need is not made for them
-    return _otherwise(solver, question, first) if first.solution.lost else first
+    first = solver.identify(question.stars, question.predicted)
+    return _otherwise(solver, question, Sight(question.stars, first))
 
 
 def identify_blind_every_way(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> Sight:
