@@ -31,7 +31,7 @@ from starpos.units import ARCSEC
 RELINEARISED, SAME_AXIS_RAD = 8, 1e-7
 SETTLED = 1e-12
 # residual in sigma of an axis that some frames cannot have
-IMPOSSIBLE = 1e6
+IMPOSSIBLE = 1e12
 # an axis that is known better than this (rad) is known
 MIN_RAD = 1e-9
 # number of zeniths that are tried, the ones that fit best at first
@@ -260,6 +260,8 @@ def _solved(
     how = {"method": "trf", "loss": "soft_l1"} if robust else {"method": "lm"}
     found = least_squares(residual, origin, x_scale="jac", xtol=SETTLED, ftol=SETTLED, **how)
     axis, there = moved(found.x)
+    if np.linalg.matrix_rank(found.jac / np.maximum(np.linalg.norm(found.jac, axis=0), 1e-9)) < len(origin):
+        return None
     spread = np.linalg.inv(found.jac.T @ found.jac)
     # by the elevations rather than what was known
     told = len(origin) - float(np.trace(np.linalg.solve(known, spread[:2, :2])))
