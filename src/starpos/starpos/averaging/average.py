@@ -15,7 +15,7 @@ from starpos.averaging.scatter import MAX_ROWS, Frames, Scatter, scatter_of
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.errors import FixError
-from starpos.fix.fix import Fix, PlaceFix
+from starpos.fix.fix import Fix, PlaceFix, zenith_variance
 from starpos.fix.terms import EACH_POSE, ErrorTerm
 from starpos.frozen import at_once
 from starpos.rotation import half_turn
@@ -71,8 +71,8 @@ class Remembered:
             place=plane.coordinates(f)[:2],
             to_rad=np.linalg.inv(turn @ f.levelling[:3]),
             shared=np.hstack(factors),
-            sigma=_sigma(own),
-            pose_sigma=_sigma(new),
+            sigma=math.sqrt(zenith_variance(own)),
+            pose_sigma=math.sqrt(zenith_variance(new)),
         )
 
     def with_next(self, other: "Remembered") -> "Remembered":
@@ -86,10 +86,6 @@ class Remembered:
             place=a * self.place + b * other.place,
             sigma=float(np.hypot(a * self.sigma, b * other.sigma)),
         )
-
-
-def _sigma(terms: Sequence[ErrorTerm]) -> float:
-    return float(np.sqrt(sum(np.trace(t.covariance[:2, :2]) for t in terms) / 2)) / EARTH_RADIUS_M
 
 
 @at_once

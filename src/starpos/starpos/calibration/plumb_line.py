@@ -2,7 +2,7 @@
 """The plumb line in the camera: A3 from the attitudes of frames and their tilts, with a known or an unknown zenith."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 
@@ -13,8 +13,8 @@ from starpos.averaging.poses import poses_of
 from starpos.averaging.scatter import Frames, Scatter, scatter_of
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.errors import FixError
-from starpos.fix.fix import Fix
-from starpos.fix.terms import EACH_POSE, ErrorTerm
+from starpos.fix.fix import Fix, zenith_variance
+from starpos.fix.terms import EACH_POSE
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import UNKNOWN_ARCSEC
@@ -70,7 +70,7 @@ class Readings:
             to_camera=np.array([f.camera.rotation.T for f in fixes]),
             plumb=plumb,
             sigma=_own_sigma(fixes),
-            common2=np.array([_variance(t for t in f.terms if t.name in OF_PLACE) for f in fixes]),
+            common2=np.array([zenith_variance(t for t in f.terms if t.name in OF_PLACE) for f in fixes]),
             pose=poses_of(fixes),
             pose_sigma=errors.pose_rad,
             columns=np.concatenate([walked, response], 2),
@@ -103,11 +103,6 @@ class Readings:
     def response(self) -> slice:
         """The columns of the response: those after the drift and the temperature of each axis."""
         return slice(2 * self.axes, self.columns.shape[2])
-
-
-def _variance(terms: Iterable[ErrorTerm]) -> float:
-    """Variance per axis in rad2 of the zenith, by terms of a fix."""
-    return float(sum(np.trace(t.covariance[:2, :2]) for t in terms)) / 2 / EARTH_RADIUS_M**2
 
 
 def _own_sigma(fixes: Sequence[Fix]) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.earth.orientation import ROTATION_RAD_S, EarthState, earth_state
+from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import (
@@ -21,7 +21,6 @@ from starpos.errors import (
     PlaceError,
     StarposError,
     TiltError,
-    TimeError,
 )
 from starpos.fix.budget import Circumstances
 from starpos.fix.checks import (
@@ -31,6 +30,7 @@ from starpos.fix.checks import (
     check_trails,
     check_unmoved,
     set_stars,
+    state_at,
     why_unidentified,
 )
 from starpos.fix.fix import IDEAL, Fix, length_text, pointing_fix, solve_fix
@@ -39,7 +39,6 @@ from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Solution, Status, solut
 from starpos.fix.star_fit import MatchedStars, sound_matches
 from starpos.frames.exposure import GLOBAL_SHUTTER, UNKNOWN_SHUTTER, Shutter
 from starpos.frames.frame import EDGE_PX, Stars
-from starpos.frames.reading import why_no_time
 from starpos.frames.tables import Pointing
 from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, field_of, fisheye, identify
 from starpos.identification._frame import FrameStars, all_within, ideal_frame, mean_sigma, unit_vectors
@@ -275,9 +274,7 @@ class Solver:
 
     def levelled(self, frame: Stars | Pointing, tilts: Tilts) -> tuple[EarthState, Tilt]:
         """State of the Earth and the tilt at a frame; StarposError if its time or the tilt cannot be used."""
-        if frame.mid_unix_s is None:
-            raise TimeError(f"{frame.place}: no time of exposure: {why_no_time(frame)}")
-        state = earth_state(frame.mid_unix_s)
+        state = state_at(frame)
         if self.instrument.vertical is not None:
             tilts = OWN_LEVEL
         own = tilts if isinstance(tilts, ByGravity) else None
@@ -285,12 +282,12 @@ class Solver:
             tilts = own.of(frame, self.instrument)
         # the width of a uniform distribution with this standard deviation, as rounding causes
         spread_s = math.sqrt(12) * frame.stamp_stddev_s
-        tilt = tilts.average(frame.mid_unix_s, frame.exposure_s or 0.0, spread_s)
+        tilt = tilts.average(state.utc_unix_s, frame.exposure_s or 0.0, spread_s)
         if tilt.either_way:
             tilt = self._upright(tilt, frame)
         if own is not None:
             own.check_held(frame, tilt)
-        self.instrument.calibration.check_age(frame.mid_unix_s)
+        self.instrument.calibration.check_age(state.utc_unix_s)
         self.instrument.inclinometer.check_live(tilt)
         self.instrument.inclinometer.check_range(tilt)
         self.instrument.inclinometer.check_axes(tilt)
@@ -348,9 +345,7 @@ class Solver:
 
         Raises StarposError if the stars, the place or the time do not determine them.
         """
-        if stars.mid_unix_s is None:
-            raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
-        state = earth_state(stars.mid_unix_s)
+        state = state_at(stars)
         camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
         up = found.attitude @ state.gcrs_to_itrs.T @ place.plumb_axes[2]
         sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
