@@ -218,9 +218,12 @@ def levelled_fix(
     of_sky, of_level = sky_rows(place), level_rows(place, link_to_enu)
     # the two axes go with the inclinometer, however it leans
     axes = rotation.shortest_turn(np.array([0.0, 0.0, 1.0]), level.up)[:, :2]
+    own, other, *rest = terms_of(of_sky)
     terms = (
-        *terms_of(of_sky),
+        own,
+        other,
         *tilt_terms(of_level, level, tilt, mounting, about.earth.utc_unix_s),
+        *rest,
         *sky_terms(of_sky, about.earth, about.clock_stddev_s, about.stamp_stddev_s, a4),
         *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
     )
