@@ -340,10 +340,8 @@ class _Track:
     @classmethod
     def before(cls, f: Fix, frame_sigma: float) -> "_Track":
         """A track without a fix, ready for fixes like `f`; frame_sigma (rad): their scatter beyond their budgets."""
-        place_filter, claim = (
-            PlaceFilter.before(_with_scatter(f, frame_sigma)),
-            Claim(frame_sigma=frame_sigma),
-        )
+        place_filter = PlaceFilter.before(_with_scatter(f, frame_sigma))
+        claim = Claim(frame_sigma=frame_sigma)
         return cls(place_filter=place_filter, pose=f, claim=claim, began_unix_s=f.utc_unix_s)
 
     def rival(self, f: Fix) -> "_Track":

@@ -170,13 +170,11 @@ def _otherwise(solver: Solver, q: Question, first: Sight) -> Sight:
 def _ways(solver: Solver, q: Question, seen: Stars) -> Iterator[Solution]:
     """Yield the answers to these stars of a frame, by one way after another; its own were searched already."""
     look = look_at(q.item, seen)
-    if seen is not q.stars:
-        yield solver.identify(seen, q.predicted)
-    if look is not None:
-        yield solver.look_again(seen, look, q.predicted)
-    yield solver.identify(seen, q.predicted, part=PART)
-    if look is not None:
-        yield solver.look_again(seen, look, q.predicted, part=PART)
+    for part in (1.0, PART):
+        if seen is not q.stars or part != 1.0:
+            yield solver.identify(seen, q.predicted, part)
+        if look is not None:
+            yield solver.identify(seen, q.predicted, part, look)
 
 
 def focal_px_that_fits(solver: Solver, stars: Stars) -> float | None:

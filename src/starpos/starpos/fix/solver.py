@@ -102,9 +102,6 @@ def _aims(stars: Stars, field: FrameStars | fisheye.WideField) -> tuple[AimPrior
     return (AimPrior(rotation.unit_vector(ra, dec)),)
 
 
-# how stars are identified: the field, the sky, the camera
-_Search = Callable[[FrameStars | fisheye.WideField, Sky, Camera], Identification | None]
-
 HourByLens = Callable[[Stars, Identification, Camera, Catalogue, Atmosphere, Place], bool]
 
 ENOUGH_SOUND = 8
@@ -148,32 +145,15 @@ class Solver:
         Sky(catalogue, triangles).load()
         return deeper.too_thin(catalogue, camera)
 
-    def identify(self, stars: Stars, predicted: Priors = (), part: float = 1.0) -> Solution:
+    def identify(
+        self, stars: Stars, predicted: Priors = (), part: float = 1.0, look: Look | None = None
+    ) -> Solution:
         """Names of the stars and pointing of the camera, near a prediction or anywhere.
 
         Stars without a time have J2000 places.
         part: of the frame in which its stars lie, as a share of its size: triangles that are looked up are no larger.
+        look: shows where the frame of stars that alone are too few has others; a fisheye's stays unidentified then.
         """
-        return self._identified(
-            stars, part, lambda field, sky, _: identify(field, sky, (*predicted, *_aims(stars, field)))
-        )
-
-    def look_again(self, stars: Stars, look: Look, predicted: Priors = (), part: float = 1.0) -> Solution:
-        """Identify stars that alone are too few, by what their frame shows where others should be.
-
-        Only for a frame on which `identify` has failed; a fisheye's stays unidentified.
-        """
-
-        def by_looking(
-            field: FrameStars | fisheye.WideField, sky: Sky, camera: Camera
-        ) -> Identification | None:
-            if isinstance(field, FrameStars):
-                return second_look(field, sky, (*predicted, *_aims(stars, field)), camera, look)
-            return None
-
-        return self._identified(stars, part, by_looking)
-
-    def _identified(self, stars: Stars, part: float, search: _Search) -> Solution:
         begin = time.perf_counter()
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
@@ -183,11 +163,15 @@ class Solver:
             field: FrameStars | fisheye.WideField | None = as_seen(camera, stars)
             if field is None:
                 if (rows := inside(stars, camera)) is not None:
-                    return self._identified(stars.select(rows), part, search).among(stars, rows)
+                    return self.identify(stars.select(rows), predicted, part, look).among(stars, rows)
                 field = field_of(
                     directions_of(camera, stars), mean_sigma(stars.covariance), camera, stars.window
                 )
-            found = search(field, sky, camera)
+            priors, found = (*predicted, *_aims(stars, field)), None
+            if look is None:
+                found = identify(field, sky, priors)
+            elif isinstance(field, FrameStars):
+                found = second_look(field, sky, priors, camera, look)
         except StarposError as e:
             return Solution.refused(stars, e)
         if found is None:
