@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from starpos.earth.gravity import SPIN, geodetic_place, gravity, gravity_gradient, zenith_at
 from starpos.earth.orientation import ROTATION_RAD_S
-from starpos.navigation.preintegration import ERRORS, Pieces, Sums
+from starpos.navigation.preintegration import ERRORS, Pieces, Sums, summed
 from starpos.navigation.records import ImuModel, VelocityLog
 from starpos.navigation.vessel import MotionLaw, Vessel
 from starpos.units import SIGMA_PER_MAD
@@ -114,6 +114,13 @@ def arrived(motion: Motion, sums: Sums, span_s: np.ndarray) -> Motion:
         place=_turned(back, place),
         velocity=_turned(back, inertial - np.cross(SPIN, place)),
         attitude=back @ attitude @ sums.turn,
+    )
+
+
+def sums_of(pieces: Pieces, motion: Motion) -> Sums:
+    """Sums between the nodes of a motion, of readings that its errors are taken off."""
+    return summed(
+        pieces, motion.gyro_bias[:-1], motion.accel_bias[:-1], motion.gyro_matrix, motion.accel_matrix
     )
 
 

@@ -32,6 +32,7 @@ from starpos.navigation.equations import (
     prior_rows,
     standing_residuals,
     star_residuals,
+    sums_of,
 )
 from starpos.navigation.estimate import Estimate, VoyageFix, fix_of
 from starpos.navigation.evidence import (
@@ -114,8 +115,6 @@ class Adjustment:
         # nodes whose measurement of a kind is wrong, and velocities that are
         self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in self.excess}
         self.strays = 0
-        # frames whose own stars do not agree
-        self.unsound = 0
         # where it stands, None before it is looked for; and whether the rest of the record contradicts that it does
         self.standing: Standstills | None = None if self.odometry is None and vessel.halts else NOWHERE
         self.contradicted = False
@@ -129,8 +128,7 @@ class Adjustment:
     @property
     def left_out(self) -> dict[str, int]:
         """How many measurements of each kind are left out."""
-        frames = self.unsound + self.strays + len(self.wrong["frames"])
-        return {"frames": frames, "velocities": int(self.slipped.sum())}
+        return {"frames": self.strays + len(self.wrong["frames"]), "velocities": int(self.slipped.sum())}
 
     @property
     def faults(self) -> tuple[str, ...]:
@@ -340,25 +338,20 @@ class Adjustment:
         return ~(self.standing or NOWHERE).links(len(self.nodes))
 
     def _attitudes(self, zenith: np.ndarray | None) -> StarAttitudes:
-        """Attitudes of all frames whose stars agree, as seen under a zenith, or roughly."""
-        found, used = [], []
-        for frame in self.frames:
-            try:
-                air = self.vessel.atmosphere
-                found.append(frame.rough() if zenith is None else frame.under(zenith, air))
-                used.append(frame)
-            except FixError:
-                pass
-        self.unsound = len(self.frames) - len(used)
-        if len(used) < MIN_FRAMES:
-            raise VoyageError(f"the stars of {len(used)} frames agree: at least {MIN_FRAMES} are needed")
+        """Attitudes of all frames, as seen under a zenith, or roughly."""
+        if len(self.frames) < MIN_FRAMES:
+            raise VoyageError(
+                f"the stars of {len(self.frames)} frames agree: at least {MIN_FRAMES} are needed"
+            )
+        air = self.vessel.atmosphere
+        found = [frame.rough() if zenith is None else frame.under(zenith, air) for frame in self.frames]
         return StarAttitudes(
-            index=np.searchsorted(self.nodes, [frame.utc_unix_s for frame in used]),
+            index=np.searchsorted(self.nodes, [frame.utc_unix_s for frame in self.frames]),
             camera_to_itrs=np.array([a.rotation for a in found]),
             covariance=np.array([a.covariance_about_own for a in found]),
             by_refraction=np.array([a.rotation.T @ a.by_refraction for a in found]),
-            stamp_stddev_s=np.array([frame.stamp_stddev_s for frame in used]),
-            rays=np.array([f.ray if isinstance(f, SunFrame) else np.zeros(3) for f in used]),
+            stamp_stddev_s=np.array([frame.stamp_stddev_s for frame in self.frames]),
+            rays=np.array([f.ray if isinstance(f, SunFrame) else np.zeros(3) for f in self.frames]),
         )
 
     def _places(self, motion: Motion) -> Residuals:
@@ -376,13 +369,7 @@ class Adjustment:
     def _chain(self, motion: Motion, stars: StarAttitudes, before: Smoothed | None) -> tuple[Chain, Links]:
         """The equations about a motion, without measurements that a solution has shown to be wrong."""
         n, count = self.unknowns, len(motion)
-        sums = summed(
-            self.pieces,
-            motion.gyro_bias[:-1],
-            motion.accel_bias[:-1],
-            motion.gyro_matrix,
-            motion.accel_matrix,
-        )
+        sums = sums_of(self.pieces, motion)
         parts = [self._sound(star_residuals(motion, stars, sums, self.pieces, n), before, "frames")]
         if self._suns:
             parts.append(self._sound(self._places(motion), before, "places"))

@@ -116,6 +116,12 @@ class Orbit:
         """Time since the epoch."""
         return (utc_unix_s - self.epoch_unix_s) / DAY_S
 
+    def reaches(self, utc_unix_s: float) -> bool:
+        """Whether an ephemeris has that time, or elements are not too old for it."""
+        if self.ephemeris is not None:
+            return bool(self.ephemeris.utc_unix_s[0] <= utc_unix_s <= self.ephemeris.utc_unix_s[-1])
+        return abs(self.age_days(utc_unix_s)) <= self.errors.max_age_days
+
 
 def read_orbits(path: Path | str) -> tuple[list[Orbit], list[str]]:
     """All orbits of a file, or of each file in a folder, and a sentence about what could not be read; SatelliteError."""
@@ -439,25 +445,18 @@ def chosen(
     """
     best: dict[int, Orbit] = {}
     left_out = {"newer": set[int](), "older": set[int]()}
-    last_epoch = -math.inf
-    for orbit in orbits:
-        age = orbit.age_days(utc_unix_s)
-        if orbit.ephemeris is not None:
-            if not orbit.ephemeris.utc_unix_s[0] <= utc_unix_s <= orbit.ephemeris.utc_unix_s[-1]:
-                left_out["older"].add(orbit.number)
-                continue
-        elif abs(age) > orbit.errors.max_age_days:
+
+    def certain(orbit: Orbit) -> tuple[float, float]:
+        days = abs(orbit.age_days(utc_unix_s))
+        return orbit.errors.along_m + orbit.errors.along_m_per_day * days, days
+
+    # the best of a satellite comes last
+    for orbit in sorted(orbits, key=certain, reverse=True):
+        if not orbit.reaches(utc_unix_s):
             left_out["older"].add(orbit.number)
-            last_epoch = max(last_epoch, orbit.epoch_unix_s)
-            continue
-        elif age < 0 and not newer:
+        elif orbit.ephemeris is None and orbit.epoch_unix_s > utc_unix_s and not newer:
             left_out["newer"].add(orbit.number)
-            continue
-        held = best.get(orbit.number)
-        if held is None or (orbit.errors.sigma(age)[1], abs(age)) < (
-            held.errors.sigma(held.age_days(utc_unix_s))[1],
-            abs(held.age_days(utc_unix_s)),
-        ):
+        else:
             best[orbit.number] = orbit
     newer_only, older_only = (len(left_out[key] - set(best)) for key in ("newer", "older"))
     said = []

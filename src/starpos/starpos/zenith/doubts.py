@@ -155,7 +155,7 @@ def _off(found: DeflectionSession) -> str:
 
 def _clock(found: DeflectionSession) -> tuple[float, str]:
     """Chi-square of the likeliest jump of the clock, and the sentence about it."""
-    step, chi2, at = _steps(found, found.leftover.by_second[..., None])
+    step, chi2, at = _steps(found, found.by_second[..., None])
     when = utc_text(found.sightings[at].utc_unix_s)
     return chi2, (
         f"the clock that stamps the frames seems to have jumped by {step[0]:+.3f} s before {when}: use the frames "
@@ -193,7 +193,7 @@ def _face_off(face: FaceQuality) -> str:
 def _steps(found: DeflectionSession, columns: np.ndarray) -> tuple[np.ndarray, float, int]:
     """The likeliest jump (m,) along columns (N, 2, m), its chi-square, and the frame from which on it holds."""
     late = np.arange(len(columns))
-    every = [found.leftover.tested(columns * (late >= k)[:, None, None]) for k in late[1:]]
+    every = [found.tested(columns * (late >= k)[:, None, None]) for k in late[1:]]
     at = int(np.argmax([chi2 for _, _, chi2 in every]))
     step, _, chi2 = every[at]
     return step, chi2, at + 1
