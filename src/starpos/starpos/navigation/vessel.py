@@ -27,12 +27,11 @@ class MotionLaw:
     climb_stddev: float
     rest_s: float
 
-    def rest_at(self, apart_s: float) -> float:
-        """The rest at times so far apart, m/s: as white noise that in the long run scatters as what keeps its sign."""
-        return self.rest_stddev * self.longer(apart_s)
-
     def longer(self, apart_s: float) -> float:
-        """Factor on the rest, or on climbing, at times so far apart."""
+        """Factor on the rest, or on climbing, at times so far apart, where it is taken for white noise.
+
+        In the long run that scatters as what keeps its sign.
+        """
         return max(1.0, 2 * self.rest_s / apart_s) ** 0.5
 
 
@@ -59,6 +58,7 @@ ANYTHING = _law(100.0, 1.0, 30.0, 0.3, 5.0, 3.0, 10.0)
 DRIFT_CHANGE, DRIFT_CHANGE_S = 0.5, 3600.0
 
 
+# stands all the time; may stand on the ground now and then
 PARKED, ROVER = "parked", "rover"
 
 
@@ -92,13 +92,3 @@ class Vessel:
         """How the drift changes where velocities are measured against water or air."""
         walk = DRIFT_CHANGE * self.drift_stddev / DRIFT_CHANGE_S**0.5
         return _law(1e-3, 1e-6, self.drift_stddev, walk, 1e-3, 1e-3, 1.0)
-
-    @property
-    def parked(self) -> bool:
-        """Whether it stands all the time."""
-        return self.vehicle == PARKED
-
-    @property
-    def halts(self) -> bool:
-        """Whether it may stand on the ground now and then."""
-        return self.vehicle == ROVER

@@ -49,7 +49,7 @@ from starpos.navigation.preintegration import Pieces, Sums, summed
 from starpos.navigation.records import ImuLog, VelocityLog
 from starpos.navigation.sightings import FrameUnderWay, SunFrame
 from starpos.navigation.start import first_motion, nodes_of
-from starpos.navigation.vessel import MotionLaw, Vessel
+from starpos.navigation.vessel import PARKED, ROVER, MotionLaw, Vessel
 from starpos.progress import Progress, quiet
 from starpos.rotation import normalised
 from starpos.units import ARCSEC
@@ -116,14 +116,16 @@ class Adjustment:
         self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in self.excess}
         self.strays = 0
         # where it stands, None before it is looked for; and whether the rest of the record contradicts that it does
-        self.standing: Standstills | None = None if self.odometry is None and vessel.halts else NOWHERE
+        self.standing: Standstills | None = (
+            None if self.odometry is None and vessel.vehicle == ROVER else NOWHERE
+        )
         self.contradicted = False
         self.slipped = np.zeros(0 if self.odometry is None else len(self.odometry.node), bool)
 
     def _law(self, vessel: Vessel) -> MotionLaw | None:
         if self.odometry is not None:
             return vessel.carried if vessel.drift_stddev > 0 else None
-        return None if vessel.parked else vessel.law
+        return None if vessel.vehicle == PARKED else vessel.law
 
     @property
     def left_out(self) -> dict[str, int]:
@@ -155,8 +157,8 @@ class Adjustment:
             )
         return tuple(said)
 
-    def settle(self, progress: Progress) -> tuple[Motion, Smoothed, int]:
-        """The motion, the solution of the last round, and how many rounds there were.
+    def settle(self, progress: Progress) -> tuple[Motion, Smoothed]:
+        """The motion, and the solution of the last round.
 
         VoyageError where the measurements do not go together, FixError where the place does not settle.
         """
@@ -190,7 +192,7 @@ class Adjustment:
             if settled and not self._revised(motion, chain, links, stars):
                 self._check_sun(motion, chain, stars)
                 progress("adjusting", 1.0)
-                return motion, solution, k + 1
+                return motion, solution
         raise FixError(
             f"the voyage's position does not converge (the last step was {step:.0f} m): check the IMU's "
             f"axes and units, and the stated vehicle"
@@ -375,7 +377,7 @@ class Adjustment:
             parts.append(self._sound(self._places(motion), before, "places"))
         if self.odometry is not None:
             parts.append(self._sound(self._velocities(motion, sums, before), before, "velocities"))
-        if self.vessel.parked:
+        if self.vessel.vehicle == PARKED:
             parts.append(standing_residuals(motion, np.arange(count), STANDING_SIGMA, n))
         rows = [part.whitened(count) for part in parts]
         if self.law is not None and self.odometry is None:
@@ -437,8 +439,7 @@ class Voyage:
     ----------
     faults : what is wrong with the record, in sentences
     excess, left_out : of frames and velocities, as `Adjustment` has them
-    rounds : of the adjustment
-    motion, solution : of its last round
+    motion : of its last round
     last : where it ends, to be carried on
 
     Examples
@@ -453,9 +454,7 @@ class Voyage:
     faults: tuple[str, ...]
     excess: dict[str, float]
     left_out: dict[str, int]
-    rounds: int
     motion: Motion
-    solution: Smoothed
     last: Estimate
 
 
@@ -483,7 +482,7 @@ def adjust_voyage(
     asked = np.concatenate([times[inside], [f.utc_unix_s for f in within]])
     nodes = nodes_of(np.unique(asked), MAX_APART_S)
     adjustment = Adjustment(within, nodes, Pieces.cut(imu, nodes), velocity, vessel, imu.vibration)
-    motion, solution, rounds = adjustment.settle(progress)
+    motion, solution = adjustment.settle(progress)
     stamp_s = float(np.median([f.stamp_stddev_s for f in within]))
     return Voyage(
         fixes=tuple(
@@ -493,9 +492,7 @@ def adjust_voyage(
         faults=(*imu.faults, *(() if velocity is None else velocity.faults), *adjustment.faults),
         excess=adjustment.excess,
         left_out=adjustment.left_out,
-        rounds=rounds,
         motion=motion,
-        solution=solution,
         last=Estimate(
             motion=motion.part(np.array([-1])),
             covariance=solution.covariance[-1],

@@ -249,6 +249,7 @@ def _of_record(number: int, name: str, record: Any) -> Orbit | str:
 def _from_lines(text: str) -> Iterator[Orbit | str]:
     """Two lines a satellite, with or without a line of its name before (Spacetrack Report 3; Kelso 1998)."""
     from sgp4.api import Satrec
+    from sgp4.io import compute_checksum
 
     lines = [line.rstrip() for line in text.splitlines()]
     before = ""
@@ -264,7 +265,11 @@ def _from_lines(text: str) -> Iterator[Orbit | str]:
             yield f"line {number}: no second line of the same satellite follows"
             continue
         number += 1
-        wrong = [n for n, text_ in ((number - 1, line), (number, second)) if not _sums(text_)]
+        wrong = [
+            n
+            for n, text_ in ((number - 1, line), (number, second))
+            if text_[68:69] != str(compute_checksum(text_))
+        ]
         if wrong:
             yield f"line {wrong[0]}: its check sum is wrong"
         else:
@@ -277,12 +282,6 @@ def _from_lines(text: str) -> Iterator[Orbit | str]:
             except ValueError as e:
                 yield f"line {number}: {one_line(e)}"
         before = ""
-
-
-def _sums(line: str) -> bool:
-    """Whether the last digit of a line is the sum of all digits before, a minus counting 1."""
-    body, last = line[:68], line[68:69]
-    return last.isdigit() and int(last) == sum(int(c) if c.isdigit() else c == "-" for c in body) % 10
 
 
 def _xml_rows(root: ET.Element) -> Iterator[dict]:

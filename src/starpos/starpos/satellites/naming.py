@@ -250,10 +250,8 @@ def agreement(found: Candidates, orbits: Sequence[Orbit]) -> Agreement:
     chance = np.log(GROUND_M2 / counts)
     spread = np.linalg.eigvalsh(found.covariance)
     starts = np.lexsort((spread[:, 1] * spread[:, 2], counts))[:MOST_STARTS]
-    tried = sorted((_fused(found, chance, int(k), steps=0) for k in starts), key=lambda a: -a.score)
-    better = sorted(
-        (_fused(found, chance, int(a.members[0]), steps=3) for a in tried[:FUSED]), key=lambda a: -a.score
-    )
+    tried = sorted(starts.tolist(), key=lambda k: -_fused(found, chance, k, steps=0).score)
+    better = sorted((_fused(found, chance, k, steps=3) for k in tried[:FUSED]), key=lambda a: -a.score)
     best = better[0]
     satellites = {orbits[k].number for k in found.orbit[best.members]}
     if (
@@ -290,12 +288,8 @@ def _fused(found: Candidates, chance: np.ndarray, start: int, steps: int) -> Agr
             if len(members):
                 own = np.linalg.inv(weights.sum(0))
                 mean = own @ np.einsum("kij,kj->i", weights, points[members])
-    rest = members[members != start]
-    return Agreement(
-        place=place + plane.T @ mean,
-        members=np.concatenate([[start], rest]) if steps == 0 else members,
-        score=float(score[rest].sum()),
-    )
+    score = score[members[members != start]].sum()
+    return Agreement(place=place + plane.T @ mean, members=members, score=float(score))
 
 
 def _scores(off: np.ndarray, covariance: np.ndarray, chance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
