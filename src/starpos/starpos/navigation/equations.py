@@ -16,7 +16,6 @@ from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.navigation.preintegration import ERRORS, Pieces, Sums, summed
 from starpos.navigation.records import ImuModel, VelocityLog
 from starpos.navigation.vessel import MotionLaw, Vessel
-from starpos.units import SIGMA_PER_MAD
 
 # Columns of a node: place m and velocity m/s in ITRS, attitude as a small rotation about ITRS's axes in rad, biases of
 # gyro and accelerometer. If a law of motion stands in for a velocity: also speed along the nose and drift in ITRS
@@ -447,10 +446,6 @@ def prior_rows(motion: Motion, model: ImuModel, vessel: Vessel, law: MotionLaw |
     return rows
 
 
-# velocities farther off come from a slipping wheel or another mishap
-OUTLIER_SIGMA = 5.0
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Odometry:
     """N velocities of a log that lie on a voyage: the interval (N,) and the node (N,) of each.
@@ -498,11 +493,9 @@ class Odometry:
         forward = np.einsum("kji,kj->ki", attitude, motion.velocity[k] + velocity - motion.drift[k])
         return self.velocity - (1 + motion.log_scale) * (forward + np.cross(motion.log_axes, forward))
 
-    def residuals(
-        self, motion: Motion, missed: np.ndarray, keep: np.ndarray, vibration: float, n: int
-    ) -> Residuals:
-        """Equations of the nodes near velocities to keep (N,); missed (N, 3): measured less predicted, m/s."""
-        weight = keep / self.sigma**2
+    def residuals(self, motion: Motion, sums: Sums, pieces: Pieces, vibration: float, n: int) -> Residuals:
+        """Equations of the nodes near velocities."""
+        missed, weight = self.missed(motion, sums, pieces), self.sigma**-2
         total = np.bincount(self.node, weight, len(motion))
         index = np.flatnonzero(total)
         mean = np.stack([np.bincount(self.node, weight * part, len(motion)) for part in missed.T], -1)[index]
@@ -520,9 +513,3 @@ class Odometry:
         constants[:, :, LOG_AXES] = -crosses(forward)
         rows[:, :, -1] = mean / total[index, None]
         return Residuals(index=index, rows=rows, covariance=(sigma**2)[:, None, None] * np.eye(3))
-
-    def sound(self, missed: np.ndarray) -> np.ndarray:
-        """Mask (N,) of the velocities that do not lie beyond what most of them scatter, or should."""
-        size = np.abs(missed).max(1) / self.sigma
-        usual = max(1.0, SIGMA_PER_MAD * float(np.median(np.abs(missed) / self.sigma[:, None])))
-        return size < OUTLIER_SIGMA * usual

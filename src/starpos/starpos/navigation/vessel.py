@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is known of instrument and vehicle before a voyage, with the laws of motion where nothing measures the speed."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
 from starpos.navigation.records import ImuModel
+from starpos.tables import packaged
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,25 +36,11 @@ class MotionLaw:
         return max(1.0, 2 * self.rest_s / apart_s) ** 0.5
 
 
-def _law(*row: float) -> MotionLaw:
-    """The law with the fields of a row, in their order."""
-    return MotionLaw(**{f.name: value for f, value in zip(fields(MotionLaw), row, strict=True)})
-
-
 LAWS = {
-    name: _law(*row)
-    for name, row in {
-        # a path at a walk, that turns and stops as it likes
-        "rover": (2.0, 0.3, 0.01, 1e-4, 0.1, 0.2, 3.0),
-        # under way, in waves of seconds, in a current that is steady over an hour
-        "ship": (10.0, 0.05, 1.0, 0.003, 0.7, 0.7, 3.0),
-        # a steady airspeed in a wind that changes by 0.3 m/s in ten minutes; gusts of seconds
-        "drone": (50.0, 0.1, 15.0, 0.012, 0.8, 0.8, 4.0),
-        "parked": (1e-3, 1e-6, 1e-3, 1e-6, 2e-3, 2e-3, 1.0),
-    }.items()
+    row.pop("vehicle"): MotionLaw(**{name: float(value) for name, value in row.items()})
+    for row in packaged("starpos.navigation", "laws.csv")
 }
-# default: any vehicle on land, at sea or in the air
-ANYTHING = _law(100.0, 1.0, 30.0, 0.3, 5.0, 3.0, 10.0)
+ANYTHING = LAWS.pop("anything")
 # of a drift such a share changes in an hour
 DRIFT_CHANGE, DRIFT_CHANGE_S = 0.5, 3600.0
 
@@ -91,4 +78,4 @@ class Vessel:
     def carried(self) -> MotionLaw:
         """How the drift changes where velocities are measured against water or air."""
         walk = DRIFT_CHANGE * self.drift_stddev / DRIFT_CHANGE_S**0.5
-        return _law(1e-3, 1e-6, self.drift_stddev, walk, 1e-3, 1e-3, 1.0)
+        return replace(LAWS[PARKED], drift_stddev=self.drift_stddev, drift_walk=walk)

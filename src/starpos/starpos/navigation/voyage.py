@@ -45,7 +45,7 @@ from starpos.navigation.evidence import (
     noise_density2,
     standstills,
 )
-from starpos.navigation.preintegration import Pieces, Sums, summed
+from starpos.navigation.preintegration import Pieces, summed
 from starpos.navigation.records import ImuLog, VelocityLog
 from starpos.navigation.sightings import FrameUnderWay, SunFrame
 from starpos.navigation.start import first_motion, nodes_of
@@ -112,7 +112,7 @@ class Adjustment:
         # how many times as much wind or current change as their law says
         self.weighings, self.more_drift = 0, 1.0
         self.noise_weighed = False
-        # nodes whose measurement of a kind is wrong, and velocities that are
+        # nodes whose measurement of a kind is wrong
         self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in self.excess}
         self.strays = 0
         # where it stands, None before it is looked for; and whether the rest of the record contradicts that it does
@@ -120,7 +120,6 @@ class Adjustment:
             None if self.odometry is None and vessel.vehicle == ROVER else NOWHERE
         )
         self.contradicted = False
-        self.slipped = np.zeros(0 if self.odometry is None else len(self.odometry.node), bool)
 
     def _law(self, vessel: Vessel) -> MotionLaw | None:
         if self.odometry is not None:
@@ -130,7 +129,9 @@ class Adjustment:
     @property
     def left_out(self) -> dict[str, int]:
         """How many measurements of each kind are left out."""
-        return {"frames": self.strays + len(self.wrong["frames"]), "velocities": int(self.slipped.sum())}
+        at = np.zeros(0, int) if self.odometry is None else self.odometry.node
+        velocities = int(np.isin(at, self.wrong["velocities"]).sum())
+        return {"frames": self.strays + len(self.wrong["frames"]), "velocities": velocities}
 
     @property
     def faults(self) -> tuple[str, ...]:
@@ -376,7 +377,8 @@ class Adjustment:
         if self._suns:
             parts.append(self._sound(self._places(motion), before, "places"))
         if self.odometry is not None:
-            parts.append(self._sound(self._velocities(motion, sums, before), before, "velocities"))
+            measured = self.odometry.residuals(motion, sums, self.pieces, self.vibration, n)
+            parts.append(self._sound(measured, before, "velocities"))
         if self.vessel.vehicle == PARKED:
             parts.append(standing_residuals(motion, np.arange(count), STANDING_SIGMA, n))
         rows = [part.whitened(count) for part in parts]
@@ -402,13 +404,6 @@ class Adjustment:
         rows = law_residuals(motion, self.law).whitened(len(motion))
         rows[stands.index] = stands.whitened(len(motion))[stands.index]
         return rows
-
-    def _velocities(self, motion: Motion, sums: Sums, before: Smoothed | None) -> Residuals:
-        assert self.odometry is not None
-        missed = self.odometry.missed(motion, sums, self.pieces)
-        if before is not None:
-            self.slipped = ~self.odometry.sound(missed)
-        return self.odometry.residuals(motion, missed, ~self.slipped, self.vibration, self.unknowns)
 
     def _sound(self, residuals: Residuals, before: Smoothed | None, kind: str) -> Residuals:
         """Equations without outliers, with wider errors where most of them scatter by more than is stated.

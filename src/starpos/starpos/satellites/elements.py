@@ -23,6 +23,7 @@ from numpy.polynomial import polynomial
 from starpos.earth.orientation import TT_MINUS_TAI_S, EarthState, earth_state, tai_minus_utc
 from starpos.errors import SatelliteError, StarposError, one_line
 from starpos.files import read_regular
+from starpos.tables import packaged
 from starpos.units import DAY_S, UNIX_EPOCH_JD, unix_of, utc_text
 
 MOST_BYTES = 300_000_000
@@ -38,7 +39,6 @@ POINTS = 9
 class OrbitErrors(NamedTuple):
     """Prior errors (1 sigma) of a class of orbits, m, at once and per day: along the motion, and across and radially."""
 
-    what: str
     along_m: float
     along_m_per_day: float
     across_m: float
@@ -52,28 +52,9 @@ class OrbitErrors(NamedTuple):
         return np.array([across, self.along_m + self.along_m_per_day * days, across])
 
 
-# Flohrer, Krag and Klinkrad (2008, AMOS) compare elements with measured orbits: 0.1 to 0.5 km across, 0.3 to 2 km along
-# in low orbits. Drag makes the error along the motion grow (Levit and Marshall 2011, Adv. Space Res. 47, 1107); who
-# manoeuvres by electric thrust leaves the elements faster. One without a name may do either.
-PASSIVE = OrbitErrors("passive", 100.0, 250.0, 150.0, 50.0, 30.0)
-MANOEUVRING = OrbitErrors("that manoeuvre", 0.0, 4000.0, 150.0, 50.0, 14.0)
-GEOSTATIONARY = OrbitErrors("geostationary", 500.0, 1000.0, 500.0, 200.0, 30.0)
-UNNAMED = OrbitErrors("without a name", 200.0, 1000.0, 300.0, 150.0, 30.0)
-OPERATORS = OrbitErrors("of an operator's ephemeris", 30.0, 300.0, 30.0, 30.0, 8.0)
-PRECISE = OrbitErrors("of a precise ephemeris", 1.0, 0.0, 1.0, 0.0, math.inf)
-# names of constellations and stations that keep their orbits by thrust
-THRUST = (
-    "STARLINK",
-    "ONEWEB",
-    "KUIPER",
-    "QIANFAN",
-    "HULIANWANG",
-    "IRIDIUM",
-    "ISS (",
-    "CSS (",
-    "TIANGONG",
-    "GLOBALSTAR",
-)
+_ROWS = {row.pop("class"): row for row in packaged("starpos.satellites", "orbit_classes.csv")}
+THRUST = tuple(_ROWS["manoeuvring"]["names"].split("|"))
+CLASSES = {name: OrbitErrors(*(float(row[f]) for f in OrbitErrors._fields)) for name, row in _ROWS.items()}
 GEOSTATIONARY_PER_DAY = 0.9, 1.1
 
 
@@ -226,10 +207,10 @@ def _orbits(text: str) -> Iterator[Orbit | str]:
 
 def _class_of(name: str, per_day: float) -> OrbitErrors:
     if GEOSTATIONARY_PER_DAY[0] < per_day < GEOSTATIONARY_PER_DAY[1]:
-        return GEOSTATIONARY
+        return CLASSES["geostationary"]
     if name.upper().startswith(THRUST):
-        return MANOEUVRING
-    return PASSIVE if name else UNNAMED
+        return CLASSES["manoeuvring"]
+    return CLASSES["passive"] if name else CLASSES["unnamed"]
 
 
 def _of_record(number: int, name: str, record: Any) -> Orbit | str:
@@ -353,7 +334,7 @@ def _from_oem(text: str) -> Iterator[Orbit | str]:
         key, equals, value = (part.strip() for part in line.partition("="))
         if key == "META_START":
             if rows:
-                yield _of_states(_number_of(about), about.get("OBJECT_NAME", ""), OPERATORS, rows)
+                yield _of_states(_number_of(about), about.get("OBJECT_NAME", ""), CLASSES["operators"], rows)
             about, rows = {}, []
         elif key.startswith("COVARIANCE_ST"):
             skipped = key == "COVARIANCE_START"
@@ -432,7 +413,7 @@ def _from_sp3(text: str) -> Iterator[Orbit | str]:
             if place.any():
                 rows.setdefault(line[1:4], []).append((utc, place @ turn.T))
     for name, states in rows.items():
-        yield _of_states(_number_of({"OBJECT_ID": name}), name, PRECISE, states)
+        yield _of_states(_number_of({"OBJECT_ID": name}), name, CLASSES["precise"], states)
 
 
 def chosen(
@@ -465,9 +446,10 @@ def chosen(
             "--newer-elements alone"
         )
     if older_only:
+        passive, manoeuvring = (CLASSES[name].max_age_days for name in ("passive", "manoeuvring"))
         said.append(
             f"the orbits of {older_only} satellites do not reach {utc_text(utc_unix_s)}, or are older than their class "
-            f"allows ({PASSIVE.max_age_days:.0f} days, {MANOEUVRING.max_age_days:.0f} for those that manoeuvre)"
+            f"allows ({passive:.0f} days, {manoeuvring:.0f} for those that manoeuvre)"
         )
     if not best:
         raise SatelliteError(f"{'; '.join(said) or 'there are no orbits'}: get elements of that day")
