@@ -36,8 +36,7 @@ class Motion:
 
     attitude (K, 3, 3): body into ITRS.  place, velocity (K, 3): ITRS, m and m/s over ground.
     gyro_bias, accel_bias (K, 3); speed (K,), drift (K, 3) of a law of motion.
-    camera_to_body (3, 3), and as it was believed to be, nominal.  gyro_matrix, accel_matrix
-    (3, 3): what readings are too large by, as shares.  log_scale, log_axes (3,): of measured velocities, as a share and
+    camera_to_body (3, 3).  gyro_matrix, accel_matrix (3, 3): what readings are too large by, as shares.  log_scale, log_axes (3,): of measured velocities, as a share and
     a small rotation.  lag_s, refraction: see the columns.
     """
 
@@ -50,7 +49,6 @@ class Motion:
     speed: np.ndarray
     drift: np.ndarray
     camera_to_body: np.ndarray
-    nominal: np.ndarray
     gyro_matrix: np.ndarray
     accel_matrix: np.ndarray
     log_scale: float = 0.0
@@ -426,9 +424,9 @@ def prior_rows(motion: Motion, model: ImuModel, vessel: Vessel, law: MotionLaw |
         sigma[SPEED], value[SPEED] = law.speed_stddev, motion.speed[0]
         sigma[DRIFT], value[DRIFT] = law.drift_stddev, motion.drift[0]
     matrix = np.where(np.eye(3, dtype=bool), model.scale_stddev, model.axes_stddev).ravel()
-    nominal = Rotation.from_matrix(motion.nominal.T @ motion.camera_to_body).as_rotvec()
+    mount = Rotation.from_matrix(vessel.camera_to_body.T @ motion.camera_to_body).as_rotvec()
     for columns, spread, now in (
-        (MOUNT, vessel.mount_stddev, nominal),
+        (MOUNT, vessel.mount_stddev, mount),
         (GYRO_MATRIX, matrix, motion.gyro_matrix.ravel()),
         (ACCEL_MATRIX, matrix, motion.accel_matrix.ravel()),
         (LOG_SCALE, SCALE_STDDEV, motion.log_scale),

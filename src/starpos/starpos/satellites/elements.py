@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Orbits of satellites from files: mean elements (TLE, 3LE; OMM in JSON, XML, CSV, KVN), and ephemerides (OEM, SP3).
+"""Orbits of satellites from files: mean elements (TLE, 3LE; OMM in JSON, XML, CSV), and ephemerides (OEM, SP3).
 
 Mean elements are for SGP4 with the constants of WGS 72 alone (Hoots and Roehrich 1980, Spacetrack Report 3; Vallado et
 al. 2006, AIAA 2006-6753), by the package sgp4; OMM and OEM are CCSDS 502.0-B, SP3 is the IGS's (Hilla 2016).
@@ -169,7 +169,7 @@ class StoredOrbits:
         return [(f.name, (state := f.stat()).st_mtime_ns, state.st_size) for f in files]
 
 
-CURE = "give TLE, OMM (JSON, XML, CSV or KVN), OEM or SP3"
+CURE = "give TLE, OMM (JSON, XML or CSV), OEM or SP3"
 
 
 def _orbits(text: str) -> Iterator[Orbit | str]:
@@ -186,15 +186,6 @@ def _orbits(text: str) -> Iterator[Orbit | str]:
         if any(e.tag.rpartition("}")[2] == "stateVector" for e in root.iter()):
             raise ValueError("an OEM in XML: give it as text (KVN)")
         yield from _from_omm(_xml_rows(root))
-    elif start.startswith("CCSDS_OMM_VERS"):
-        parts = (part.splitlines() for part in text.split("CCSDS_OMM_VERS")[1:])
-        yield from _from_omm(
-            {
-                key.strip(): value.split("[")[0].strip()
-                for key, _, value in (line.partition("=") for line in part)
-            }
-            for part in parts
-        )
     elif start.startswith("CCSDS_OEM_VERS"):
         yield from _from_oem(text)
     elif start[:2] in ("#a", "#b", "#c", "#d"):

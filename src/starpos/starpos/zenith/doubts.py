@@ -120,19 +120,18 @@ def _worse(found: DeflectionSession) -> list[str]:
     if found.as_stated is None:
         return []
     stated, shown = found.as_stated.inclinometer, found.inclinometer
-    fields = (
+    said = []
+    for name, field, unit in (
         ("tilt_drift_arcsec_per_sqrt_hour", "drift_rad_per_sqrt_hour", ARCSEC),
         ("tilt_scale", "scale", 1.0),
-    )
-    sizes = [
-        (name, getattr(stated, field) / unit, getattr(shown, field) / unit) for name, field, unit in fields
-    ]
-    return [
-        f"the tiltmeter shows a {name} of {more:.2g}, its file states {less:.2g}: the errors hold what it "
-        "shows; state that, or calibrate it"
-        for name, less, more in sizes
-        if more > 1.01 * less
-    ]
+    ):
+        less, more = (getattr(errors, field) / unit for errors in (stated, shown))
+        if more > 1.01 * less:
+            said.append(
+                f"the tiltmeter shows a {name} of {more:.2g}, its file states {less:.2g}: the errors hold what it "
+                "shows; state that, or calibrate it"
+            )
+    return said
 
 
 def _zones_arcsec(found: DeflectionSession) -> float:

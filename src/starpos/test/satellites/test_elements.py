@@ -35,13 +35,9 @@ def xml(fields):
 FORMS = {
     "two.tle": f"{FIRST}\n{SECOND}\n",
     "three.tle": f"0 VANGUARD 1\r\n{FIRST}\r\n{SECOND}\r\n",
-    "one.json": json.dumps([FIELDS]),
+    # the day of the year, as CCSDS 502.0-B allows
+    "one.json": json.dumps([FIELDS | {"EPOCH": "2000-179T18:50:19.733568"}]),
     "one.xml": xml(FIELDS),
-    # the day of the year, and a unit, as CCSDS 502.0-B allows
-    "one.kvn": "CCSDS_OMM_VERS = 3.0\n"
-    + "".join(f"{key} = {value}\n" for key, value in FIELDS.items())
-    .replace("2000-06-27T", "2000-179T")
-    .replace("10.82419157", "10.82419157 [rev/day]"),
     "one.csv": ",".join(FIELDS) + "\n" + ",".join(map(str, FIELDS.values())) + "\n",
 }
 
