@@ -37,7 +37,8 @@ class Motion:
     attitude (K, 3, 3): body into ITRS.  place, velocity (K, 3): ITRS, m and m/s over ground.
     gyro_bias, accel_bias (K, 3); speed (K,), drift (K, 3) of a law of motion.
     camera_to_body (3, 3).  gyro_matrix, accel_matrix (3, 3): what readings are too large by, as shares.
-    log_scale, log_axes (3,): of measured velocities, as a share and a small rotation.  lag_s, refraction: see the columns.
+    log_scale, log_axes (3,): of measured velocities, as a share and a small rotation.  lag_s, refraction: see the
+    columns.
     """
 
     utc_unix_s: np.ndarray
