@@ -45,11 +45,11 @@ class OrbitErrors(NamedTuple):
     across_m_per_day: float
     max_age_days: float
 
-    def sigma(self, age_days: float) -> np.ndarray:
-        """Standard deviations (3,) in m: radial, along, across."""
-        days = abs(age_days)
+    def sigma(self, age_days: float | np.ndarray) -> np.ndarray:
+        """Standard deviations (..., 3) in m: radial, along, across, of orbits that are so old (...)."""
+        days = np.abs(age_days)
         across = self.across_m + self.across_m_per_day * days
-        return np.array([across, self.along_m + self.along_m_per_day * days, across])
+        return np.stack([across, self.along_m + self.along_m_per_day * days, across], -1)
 
 
 _ROWS = {row.pop("class"): row for row in packaged("starpos.satellites", "orbit_classes.csv")}

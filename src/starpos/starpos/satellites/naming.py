@@ -16,7 +16,7 @@ from starpos.earth.gravity import SPIN
 from starpos.errors import SatelliteError
 from starpos.frozen import at_once
 from starpos.rotation import normalised
-from starpos.satellites.elements import Orbit
+from starpos.satellites.elements import Orbit, OrbitErrors
 from starpos.satellites.orbits import Moments, along_axes, enu_at
 from starpos.satellites.trails import SatelliteTrail
 from starpos.units import DAY_S, UNIX_EPOCH_JD
@@ -78,14 +78,12 @@ class OrbitsAbove:
         self._records = SatrecArray([o.record for o in orbits if o.ephemeris is None])
         self.count = len(orbits)
         self._epochs = np.array([o.epoch_unix_s for o in orbits])
-        at_once = np.array([o.errors.sigma(0.0) for o in orbits])
-        self._errors = at_once, np.array([o.errors.sigma(1.0) for o in orbits]) - at_once
+        self._errors = np.array([o.errors for o in orbits])
         self._nodes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def sigma(self, rows: np.ndarray, utc_unix_s: float) -> np.ndarray:
         """Prior errors (K, 3) of some orbits, m: radial, along, across."""
-        at_once, per_day = self._errors[0][rows], self._errors[1][rows]
-        return at_once + per_day * np.abs(utc_unix_s - self._epochs[rows, None]) / DAY_S
+        return OrbitErrors(*self._errors[rows].T).sigma((utc_unix_s - self._epochs[rows]) / DAY_S)
 
     def toward(self, direction: np.ndarray, utc_unix_s: float) -> np.ndarray:
         """Rows (K,) of the orbits that may stand in a direction (3,) in ITRS from the ground, and some more."""
