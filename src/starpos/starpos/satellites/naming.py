@@ -78,7 +78,7 @@ class OrbitsAbove:
         self._records = SatrecArray([o.record for o in orbits if o.ephemeris is None])
         self.count = len(orbits)
         self._epochs = np.array([o.epoch_unix_s for o in orbits])
-        self._errors = np.array([o.errors for o in orbits])
+        self._errors = np.array([o.errors for o in orbits], float).reshape(-1, len(OrbitErrors._fields))
         self._nodes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def sigma(self, rows: np.ndarray, utc_unix_s: float) -> np.ndarray:
