@@ -140,8 +140,7 @@ def placeless(xy: np.ndarray, covariance_px2: np.ndarray, optics: Camera, itrs: 
     FixError if the stars disagree.
     """
     seen = fit_seen(xy, covariance_px2, optics, itrs)
-    covariance = seen.errors.rotation_covariance(seen.errors.centroids)
-    return Attitude(np.eye(3), covariance, of=CAMERA, into=CAMERA).then(seen.fit.a4.T, ITRS)
+    return Attitude(np.eye(3), seen.own, of=CAMERA, into=CAMERA).then(seen.fit.a4.T, ITRS)
 
 
 # how far a direction that is said to be the Sun's may be from it, rad
