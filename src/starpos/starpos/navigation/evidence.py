@@ -1,17 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a record itself shows of its assumptions: where the vehicle stands, and how well a law of motion holds.
 
-No single sign distinguishes a standing vehicle from one that rolls evenly and straight.  So three signs must agree.
-Its attitude is constant within the errors of the stars, which no vehicle that rolls on real ground achieves.  Its
-readings are quieter than while it surely moves: a vehicle whose motion is not felt never counts as standing.  And the
-rest of the record, without that standstill, determines its velocity well enough, and it is 0.  If one of them cannot be
-0, all are rejected: it is unknown which of the contradicting ones are true.
-
-Of a law of motion, only the motion across the nose shows how much wind and gusts change from one minute to the next,
-since the speed along the nose is unknown.  A trend, steady from end to end of the record, looks like an error of the
-place, so it cannot be used.  Minutes reveal it as far as a wind is a random walk.  A slow swing, half a wave or two over
-the record, hides a trend of its own size.  Calm air may drift without either, so the record may widen how fast the drift
-changes, and never narrows it.
+docs/navigation.md, how it works, says which signs have to agree and why.  Of a law of motion a trend, steady from end to
+end, cannot be used, since it looks like an error of the place; a slow swing hides a trend of its own size.
 """
 
 from dataclasses import dataclass, replace
