@@ -16,6 +16,7 @@ from starpos.navigation.chain import Smoothed
 from starpos.navigation.equations import Motion, Residuals, StarAttitudes
 from starpos.navigation.preintegration import Pieces
 from starpos.navigation.vessel import MotionLaw
+from starpos.rotation import normalised
 from starpos.units import ARCSEC
 
 # turn rate (rad/s) above which it surely moves, and minimum time (s) between the frames that show it
@@ -200,7 +201,9 @@ def borne_out(law: MotionLaw, motion: Motion) -> MotionLaw:
     number = int(min(t[-1] // MEAN_S, MAX_MEANS))
     if number < MIN_MEANS:
         return law
-    side, across = _sideways(motion)
+    # level, across the nose, and the velocity along it
+    side = normalised(np.cross(zenith_at(motion.place), motion.attitude[:, :, 0]))
+    across = np.einsum("ki,ki->k", side, motion.velocity)
     latitude, longitude, _ = (float(x) for x in geodetic_place(motion.place[len(motion) // 2]))
     means = independent_means(t, side @ enu_axes(latitude, longitude)[:2].T, across, number)
     rest = law.rest_stddev * law.longer(float(np.median(np.diff(t))))
@@ -221,13 +224,6 @@ def borne_out(law: MotionLaw, motion: Motion) -> MotionLaw:
         drift_walk=law.drift_walk * float(np.sqrt(walk2 + trend2)),
         rest_stddev=law.rest_stddev * max(float(np.sqrt(rest2)), gusts / rest),
     )
-
-
-def _sideways(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Level directions (K, 3) across the nose at each node, and the velocity (K,) along them."""
-    side = np.cross(zenith_at(motion.place), motion.attitude[:, :, 0])
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    return side, np.einsum("ki,ki->k", side, motion.velocity)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
