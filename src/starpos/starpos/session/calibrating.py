@@ -5,8 +5,9 @@ are here because they must forget at the same events: an average holds for one i
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from types import coroutine
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from starpos.identification import Identification
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
 from starpos.instrument.tilt_log import TiltLog, TiltsByTime
-from starpos.session.driver import Coming, Diagnosis, Jobs, Level, Log, Outcome
+from starpos.session.driver import Diagnosis, Jobs, Level, Log, Outcome
 from starpos.session.settings import Settings
 from starpos.session.standing import Averaging, News
 
@@ -207,7 +208,6 @@ class Calibrating:
         # Grows when the instrument or the place changes; a job of an older era is out of date.
         self._era = 0
         self._worker = jobs
-        self._running: Coming | None = None
         # Whether a service waits for a job.
         self._asked = False
         # Whether to calibrate by itself again when there is time.
@@ -391,7 +391,7 @@ class Calibrating:
         except StarposError as e:
             self._said = str(e)
             return
-        self._run(job).add_done_callback(lambda future: self._turned_by_itself(future.result(), era))
+        self._worker.run(job, lambda outcome: self._turned_by_itself(outcome, era))
 
     def _turned_by_itself(self, outcome: Outcome, era: int) -> None:
         if era == self._era:
@@ -449,22 +449,18 @@ class Calibrating:
             return Outcome(trouble="another calibration is being worked out: call again when it has answered")
         self._asked = True
         try:
-            if self._worker.busy and self._running is not None:
-                await self._running
-            job, era = prepare(), self._era
-            outcome = await self._run(job)
+            await _until(lambda: not self._worker.busy)
+            era, came = self._era, deque[Outcome]()
+            self._worker.run(prepare(), came.append)
+            await _until(lambda: bool(came))
         except StarposError as e:
             return Outcome(trouble=str(e))
         finally:
             self._asked = False
         if era != self._era:
             changed = "the instrument was changed, moved or reset meanwhile: call again"
-            return Outcome(trouble=outcome.trouble or changed)
-        return outcome
-
-    def _run(self, job: Callable[[], object]) -> Coming:
-        self._running = self._worker.run(job)
-        return self._running
+            return Outcome(trouble=came[0].trouble or changed)
+        return came[0]
 
     def report(self) -> Diagnosis:
         """Make the diagnostic `Calibration`."""
@@ -479,6 +475,13 @@ class Calibrating:
                 Level.WARN, f"the misalignment of camera and inclinometer is not known: {remedy}", values
             )
         return Diagnosis(Level.OK, self._about or "from the parameters", values)
+
+
+@coroutine
+def _until(done: Callable[[], bool]) -> Iterator[None]:
+    """Wait in a coroutine of the node, which its executor resumes again and again."""
+    while not done():
+        yield
 
 
 def _about(found: Calibrated) -> str:

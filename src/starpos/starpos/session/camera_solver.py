@@ -136,7 +136,7 @@ class CameraSolver:
             solver = self._make(camera)
             return solver, solver.prepare(camera.width, camera.height)
 
-        self._jobs.run(work).add_done_callback(lambda f: self._prepared(camera, f.result()))
+        self._jobs.run(work, lambda made: self._prepared(camera, made))
 
     def _prepared(self, camera: Camera, made: Outcome) -> None:
         if self.camera is None:

@@ -13,7 +13,7 @@ from starpos.frames.frame import Stars
 from starpos.identification import Identification
 from starpos.instrument.tilt_log import Tilts
 from starpos.session.calibrating import OF_AVERAGE
-from starpos.session.driver import Diagnosis, Jobs, Level
+from starpos.session.driver import Diagnosis, Jobs, Level, Outcome
 from starpos.session.settings import Settings
 from starpos.zenith.adjustment import DeflectionSession
 from starpos.zenith.doubts import checked_session
@@ -33,7 +33,7 @@ class LiveDeflection:
     """Collects sightings at the mark of the parameters, while deflection.wanted is set, and adjusts them in a job."""
 
     def __init__(self, settings: Settings, jobs: Jobs) -> None:
-        self._settings, self._jobs, self._era = settings, jobs, 0
+        self._settings, self._jobs = settings, jobs
         self.forget()
 
     def forget(self) -> None:
@@ -43,8 +43,7 @@ class LiveDeflection:
         self._trouble = self._left_out = ""
         # number of frames in the last adjustment
         self._adjusted_of = 0
-        # a job of an older session is out of date
-        self._era += 1
+        self._jobs.disown()
 
     @property
     def measures(self) -> bool:
@@ -84,18 +83,14 @@ class LiveDeflection:
             self._adjust(solver, mark)
 
     def _adjust(self, solver: Solver, mark: Place) -> None:
-        era, sightings = self._era, tuple(self._sightings)
+        sightings = tuple(self._sightings)
         self._adjusted_of = len(sightings)
         # an A3 that was found by turning comes from these very frames
         instrument, air = self._settings.instrument(None), solver.atmosphere
-        coming = self._jobs.run(lambda: checked_session(sightings, instrument, air, mark))
+        self._jobs.run(lambda: checked_session(sightings, instrument, air, mark), self._adjusted)
 
-        def done(result: object) -> None:
-            outcome = coming.result()
-            if era == self._era:
-                self._found, self._trouble = outcome.value, outcome.trouble
-
-        coming.add_done_callback(done)
+    def _adjusted(self, made: Outcome) -> None:
+        self._found, self._trouble = made.value, made.trouble
 
     def report(self) -> Diagnosis:
         """What the session has so far, and whether it is enough."""

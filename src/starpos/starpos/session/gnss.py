@@ -227,8 +227,7 @@ class GnssTeacher:
             path, learned = path_of(self._values["gnss.learned"]), self.learned
             assert learned is not None
             self._saved = learned
-            coming = self._jobs.run(lambda: states.save_learned(path, learned))
-            coming.add_done_callback(lambda f: self._note(f.result().trouble))
+            self._jobs.run(lambda: states.save_learned(path, learned), lambda o: self._note(o.trouble))
 
     def close(self) -> None:
         """Write what was learned, at the end."""

@@ -123,8 +123,7 @@ class NavigatorSession:
         self._seen_s = -math.inf
         self._clock_stddev_s = 0.0
         self._gnss = ComparedPlaces()
-        # marks outcomes of jobs that began before as out of date
-        self._voyage = object()
+        self._jobs.disown()
 
     @property
     def busy(self) -> bool:
@@ -258,15 +257,11 @@ class NavigatorSession:
         if len(inside) < MIN_FRAMES or time_s - record.blocks[0][0, 0] < SHORTEST_S:
             return
         self._adjusted_s = time_s
-        vessel, voyage = self._settings.vessel(self._clock_stddev_s), self._voyage
+        vessel = self._settings.vessel(self._clock_stddev_s)
         sun = next((f for f in reversed(inside) if isinstance(f, SunFrame)), None)
-        self._jobs.run(lambda: record.adjusted(vessel)).add_done_callback(
-            lambda f: self._adjusted(f.result(), voyage, sun)
-        )
+        self._jobs.run(lambda: record.adjusted(vessel), lambda made: self._adjusted(made, sun))
 
-    def _adjusted(self, made: Outcome, voyage: object, sun: SunFrame | None) -> None:
-        if voyage is not self._voyage:
-            return
+    def _adjusted(self, made: Outcome, sun: SunFrame | None) -> None:
         self.counts["adjustments"] += 1
         self._trouble, self._faults = made.trouble, ()
         if made.trouble:
