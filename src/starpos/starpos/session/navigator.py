@@ -32,7 +32,7 @@ from starpos.navigation.voyage import MIN_FRAMES, Voyage
 from starpos.session.driver import Changes, Diagnosis, Heard, Jobs, Level, Log, Now, Outcome, refusing
 from starpos.session.gnss import OLDEST_S, ComparedPlaces, contradiction
 from starpos.session.reports import AHEAD_S
-from starpos.session.settings import MIN_CLOCK_S, NodeSettings, atmosphere_of
+from starpos.session.settings import MIN_CLOCK_S, NodeSettings
 
 # of a stated altitude: the vehicle goes up and down by more than its file says
 MIN_HEIGHT_STDDEV_M = 10.0
@@ -62,7 +62,7 @@ class NavigatorSettings(NodeSettings):
             model=self._files["imu_model"] or ImuModel(),
             camera_to_body=np.asarray(known.link_to_camera, float).T,
             mount_stddev=float(np.radians(values["mount_stddev"])),
-            atmosphere=atmosphere_of(values),
+            atmosphere=self.atmosphere,
             clock_stddev_s=max(known.clock_stddev_s, clock_stddev_s) if np.isnan(clock) else clock,
             drift_stddev=values["drift_stddev"],
             **stated,
