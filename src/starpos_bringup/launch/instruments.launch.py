@@ -16,13 +16,6 @@ from launch_ros.actions import PushRosNamespace
 from starpos_bringup import launching
 from starpos_bringup.launch_arguments import names
 
-ARGUMENTS = (
-    ("instruments", None, "names of the instruments, separated by commas: left,right"),
-    *launching.COMMON_ARGUMENTS,
-    ("params_file", None, "parameters of all nodes of all instruments"),
-    ("namespace", "", "of all of them: /NAMESPACE/left/fix and so on"),
-    *launching.LIVE_ARGUMENTS,
-)
 FRAMES = {
     "camera": "starpos_camera_optical_frame",
     "inclinometer": "starpos_inclinometer_frame",
@@ -46,4 +39,4 @@ def nodes(told):
 
 
 def generate_launch_description():
-    return launching.described(ARGUMENTS, nodes)
+    return launching.described("instruments", nodes)

@@ -13,13 +13,6 @@ from launch.actions import Shutdown
 from starpos_bringup import launching
 from starpos_bringup.launch_arguments import LaunchError, is_true, number
 
-ARGUMENTS = (
-    *launching.COMMON_ARGUMENTS,
-    ("bag", None, "the rosbag2: a folder, or one .mcap or .db3 file"),
-    ("rate", "1", "times real time; 0: as fast as the solver answers"),
-    ("detector", "false", "true: stars from the bag's images instead of the bag's stars"),
-    launching.DASHBOARD_ARGUMENT,
-)
 MAX_RATE = 1e6
 SIMULATED = {"**": {"use_sim_time": True}}
 
@@ -51,4 +44,4 @@ def nodes(told):
 
 
 def generate_launch_description():
-    return launching.described(ARGUMENTS, nodes)
+    return launching.described("replay", nodes)

@@ -9,25 +9,6 @@ config/existing_robot.yaml.
 
 from starpos_bringup import launching
 
-ARGUMENTS = (
-    ("image", None, "the camera's topic, sensor_msgs/Image, or the one whose /compressed is sent"),
-    ("camera_info", None, "the topic of its intrinsics"),
-    ("imu", None, "the IMU's topic, sensor_msgs/Imu with accelerations"),
-    *launching.COMMON_ARGUMENTS,
-    (
-        "params_file",
-        None,
-        "parameters of the nodes: a copy of config/existing_robot.yaml, with your own values",
-    ),
-    (
-        "namespace",
-        "starpos",
-        "of what the nodes publish: /NAMESPACE/fix, so that it is not mixed with a GNSS receiver's",
-    ),
-    *launching.LIVE_ARGUMENTS,
-    launching.DASHBOARD_ARGUMENT,
-)
-
 
 def nodes(told):
     common, every = launching.Common.of(told), launching.clock_of(told)
@@ -43,4 +24,4 @@ def nodes(told):
 
 
 def generate_launch_description():
-    return launching.described(ARGUMENTS, nodes)
+    return launching.described("robot", nodes)

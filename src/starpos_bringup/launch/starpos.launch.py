@@ -9,15 +9,6 @@ Without an argument the value of the parameter file holds.
 from starpos_bringup import launching
 from starpos_bringup.launch_arguments import is_true
 
-ARGUMENTS = (
-    *launching.COMMON_ARGUMENTS,
-    *launching.LIVE_ARGUMENTS,
-    ("camera", "", "source of frames: files, simulated, gphoto2, indi, alpaca, video"),
-    ("port", "", "serial port of the inclinometer; prefer a path under /dev/serial/by-id"),
-    ("navigator", "false", "true: also the place under way, by an IMU on imu/data"),
-    launching.DASHBOARD_ARGUMENT,
-)
-
 
 def nodes(told):
     source = {"source": told["camera"]} if told["camera"] else {}
@@ -30,4 +21,4 @@ def nodes(told):
 
 
 def generate_launch_description():
-    return launching.described(ARGUMENTS, nodes)
+    return launching.described("starpos", nodes)

@@ -4,7 +4,7 @@
 import atexit
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,39 +16,13 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.substitutions import FindPackageShare
 
+from starpos.parameters.table import rows_of
 from starpos_bringup.launch_arguments import LaunchError, is_true, names, one_of
 
 if TYPE_CHECKING:
     from launch import LaunchDescriptionEntity
 
-Arguments = Iterable[tuple[str, Any, str]]
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
-# Name, default and description of each argument.
-COMMON_ARGUMENTS = (
-    ("namespace", "", "moves the whole instrument: /NAMESPACE/fix and so on"),
-    (
-        "params_file",
-        PathJoinSubstitution([FindPackageShare("starpos_bringup"), "config", "starpos.yaml"]),
-        "parameters of all nodes",
-    ),
-    ("log_level", "info", ", ".join(LOG_LEVELS)),
-    (
-        "outputs",
-        "",
-        "puts fix, fix_averaged and heading/imu under this name: stars is stars/fix, where another driver has fix",
-    ),
-    (
-        "enclaves",
-        "/starpos",
-        "where the SROS2 enclaves are: each process has enclaves/EXECUTABLE, if security is enabled",
-    ),
-)
-# of launch files for a live instrument
-LIVE_ARGUMENTS = (
-    ("use_sim_time", "", "true: time from /clock"),
-    ("respawn", "false", "true: a process that ends, for whatever reason, is started again 2 s later"),
-)
-DASHBOARD_ARGUMENT = ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042")
 RESPAWN_DELAY_S = 2.0
 # Topics of the solver whose names drivers of GNSS and IMUs have, too.
 OUTPUTS = ("fix", "fix_averaged", "heading/imu")
@@ -81,20 +55,25 @@ class Common:
 
 
 def described(
-    arguments: Arguments, entities: Callable[[Mapping[str, str]], "list[LaunchDescriptionEntity]"]
+    file: str, entities: Callable[[Mapping[str, str]], "list[LaunchDescriptionEntity]"]
 ) -> LaunchDescription:
-    """Describe a launch: `entities` makes what is started from the values of the arguments, in their namespace.
+    """Describe a launch: `entities` makes what is started from the values of the file's arguments, in their namespace."""
+    rows = rows_of(Path(__file__).with_name("data") / "launch.yaml")[file]
 
-    Of two arguments of one name the later holds.
-    """
-    known = {name: (value, text) for name, value, text in arguments}
+    def default(row: Mapping[str, str]) -> str | PathJoinSubstitution | None:
+        if "share" in row:
+            return PathJoinSubstitution([FindPackageShare("starpos_bringup"), *row["share"].split("/")])
+        return row.get("default")
 
     def started(context: Any) -> "list[LaunchDescriptionEntity]":
-        return entities({name: LaunchConfiguration(name).perform(context) for name in known})
+        return entities({name: LaunchConfiguration(name).perform(context) for name in rows})
 
     return LaunchDescription(
         [
-            *(DeclareLaunchArgument(n, default_value=v, description=text) for n, (v, text) in known.items()),
+            *(
+                DeclareLaunchArgument(n, default_value=default(r), description=r["text"])
+                for n, r in rows.items()
+            ),
             PushRosNamespace(LaunchConfiguration("namespace")),
             OpaqueFunction(function=started),
         ]
