@@ -80,7 +80,7 @@ class SolverSession:
         # whether another frame can be answered at once, live: whoever drives the session calls `at` again, so that
         # messages that arrived meanwhile are taken first
         self.more = False
-        self.tilts = TiltBuffer()
+        self.tilts = TiltBuffer(settings)
         self.doubt = ClockDoubt()
         self.gyro = Gyro(heard)
         self.satellites: LiveSatellites | None = None
@@ -177,7 +177,7 @@ class SolverSession:
 
     def _receive_tilt(self, message: Any, sent: Sent, now: Now) -> None:
         with refusing(self._heard, "tilt"):
-            self.tilts.receive(message, sent, now, self._settings.tilt_stddev_rad)
+            self.tilts.receive(message, sent, now)
 
     def receive_stars(self, message: Any, now: Now, sent: Sent = NOTHING_TOLD) -> list[Output]:
         """Take a StarArray, and those that have come after it."""
@@ -283,7 +283,7 @@ class SolverSession:
         if now.unix_s > was_s:
             for message in self.tilts.pop_early():
                 with refusing(self._heard, "tilt"):
-                    self.tilts.keep_in_time(message, now, self._settings.tilt_stddev_rad)
+                    self.tilts.keep_in_time(message, now)
 
     def _work(self, now: Now) -> list[Output]:
         """Answer what can be answered, and have the trails of these frames looked at."""
@@ -318,22 +318,14 @@ class SolverSession:
             frame = self._backlog.first = replace(frame, since_s=now.waiting_s)
         mid, waited_s = frame.stars.mid_unix_s, now.waiting_s - frame.since_s
         # a negative wait: the clock has begun anew
-        if (
-            mid is None
-            or self._ended
-            or waited_s > self.tilts.patience_s(self._values["tilt_timeout"])
-            or waited_s < 0
-        ):
+        if mid is None or self._ended or waited_s > self.tilts.patience_s or waited_s < 0:
             return True
         if self.instrument.solver is None:
             return bool(self.instrument.trouble)
         # an instrument at a known place may have no inclinometer
         if self.places.known and not len(self.tilts):
             return True
-        return self.tilts.complete(mid, self._span(frame.stars))
-
-    def _span(self, stars: Stars) -> float:
-        return stars.exposure_s or self._values["tilt_window"]
+        return self.tilts.complete(mid, frame.stars.exposure_s or 0.0)
 
     def _solve(self, frame: Waiting, now: Now) -> list[Output]:
         predicted: Priors = self._guarded(
@@ -376,9 +368,7 @@ class SolverSession:
         # a node has no picture to look at, only the list
         stars = frame.stars
         places = self.places if self.places.known else None
-        return Question(
-            item=stars, stars=stars, tilts=self.tilts.over(self._span(stars)), places=places, **known
-        )
+        return Question(item=stars, stars=stars, tilts=self.tilts, places=places, **known)
 
     def _answer(self, frame: Waiting, question: Question) -> Solution:
         def work() -> Solution:
@@ -442,7 +432,7 @@ class SolverSession:
         if answer.status is Status.BAD_INPUT and frame.ahead_s > reports.AHEAD_S:
             return []
         try:
-            tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, self._span(stars))
+            tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
             solver.instrument.inclinometer.check_live(tilt)
         except StarposError:
             return []
