@@ -137,10 +137,8 @@ STARS, TRAILS, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Tr
 # types by the relative names of the solver's inputs
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}
-# further inputs, with gnss.use
-GNSS = {"gnss/fix": NAV_SAT_FIX}
-# further inputs, with satellites.elements
-SATELLITES = {"trails": TRAILS}
+# with gnss.use and with satellites.elements, too
+ALL_INPUTS = {**INPUTS, "gnss/fix": NAV_SAT_FIX, "trails": TRAILS}
 
 
 @dataclass(frozen=True)

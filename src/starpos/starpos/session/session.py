@@ -28,6 +28,7 @@ from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
+from starpos.recording.topics import ALL_INPUTS, CAMERA_INFO, NAV_SAT_FIX, STARS, TILT, TRAILS
 from starpos.session import reports
 from starpos.session.calibrating import Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
@@ -46,6 +47,8 @@ if TYPE_CHECKING:
     from starpos.session.satellites import LiveSatellites
 
 T = TypeVar("T")
+# what takes a message; it may return answers
+Take = Callable[[Any, Now, Sent], list[Output] | None]
 NOTHING_TOLD = Sent()
 J2000_UNIX_S = 946_728_000.0
 # A stamp further in the future than AHEAD_S and this many stated sigmas is wrong.
@@ -85,12 +88,21 @@ class SolverSession:
         self.gyro = Gyro(heard)
         self.satellites: LiveSatellites | None = None
         if settings.orbits is not None:
-            from starpos.session import satellites
+            from starpos.session import satellites as live
 
-            self.satellites = satellites.LiveSatellites(settings, settings.orbits, jobs(), heard)
+            self.satellites = live.LiveSatellites(settings, settings.orbits, jobs(), heard)
         self.gnss: GnssTeacher | None = None
         if settings.values["gnss.use"]:
             self.gnss = GnssTeacher(settings, jobs(), heard, log, self.satellites)
+        self._take: dict[str, Take] = {
+            CAMERA_INFO: self._take_camera,
+            TILT: self._take_tilt,
+            STARS: self._take_stars,
+        }
+        if (gnss := self.gnss) is not None:
+            self._take[NAV_SAT_FIX] = lambda message, now, sent: gnss.receive(message, now)
+        if (satellites := self.satellites) is not None:
+            self._take[TRAILS] = lambda message, now, sent: satellites.receive(message)
         self.places = SessionPlaces(settings, self.gnss, self.satellites)
         self.deflection = LiveDeflection(settings, jobs())
         self._search = Search(settings.values)
@@ -136,6 +148,11 @@ class SolverSession:
         self.deflection.forget()
 
     @property
+    def inputs(self) -> dict[str, str]:
+        """The types of the messages that it takes by the relative names of their topics."""
+        return {name: kind for name, kind in ALL_INPUTS.items() if kind in self._take}
+
+    @property
     def waits(self) -> bool:
         """Whether a frame or a tilt waits for its time."""
         return bool(self._backlog) or self.tilts.waits
@@ -158,34 +175,30 @@ class SolverSession:
 
     # inputs ----------------------------------------------------------------------------------------------------------
 
-    def receive_camera(self, message: Any, now: Now) -> list[Output]:
-        """Take a CameraInfo.
+    def receive(self, kind: str, message: Any, now: Now, sent: Sent = NOTHING_TOLD) -> list[Output]:
+        """Take a message of a type of `inputs`.
 
-        Another camera's counts from now on; in recorded data from its stamp on, since it may be read before frames that
+        Another camera counts from now on; in recorded data from its stamp on, since it may be read before frames that
         were taken before it.
         """
         made = self._begun(now)
+        made += self._take[kind](message, now, sent) or []
+        return made + self._work(now)
+
+    def _take_camera(self, message: Any, now: Now, sent: Sent) -> None:
         with refusing(self._heard, "camera_info"):
             self.instrument.receive(message, at_once=not now.played)
-        return made + self._work(now)
 
-    def receive_tilt(self, message: Any, sent: Sent, now: Now) -> list[Output]:
-        """Take a Tilt."""
-        made = self._begun(now)
-        self._receive_tilt(message, sent, now)
-        return made + self._work(now)
-
-    def _receive_tilt(self, message: Any, sent: Sent, now: Now) -> None:
+    def _take_tilt(self, message: Any, now: Now, sent: Sent) -> None:
         with refusing(self._heard, "tilt"):
             self.tilts.receive(message, sent, now)
 
-    def receive_stars(self, message: Any, now: Now, sent: Sent = NOTHING_TOLD) -> list[Output]:
+    def _take_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
         """Take a StarArray, and those that have come after it."""
-        made = self._begun(now)
-        made += self._add_stars(message, now, sent)
+        made = self._add_stars(message, now, sent)
         for later, later_sent in self._arrived_stars():
             made += self._add_stars(later, now, later_sent)
-        return made + self._work(now)
+        return made
 
     def _add_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
         """Have a frame wait for its tilts, if there is room; return a bad one's answer."""
@@ -242,19 +255,6 @@ class SolverSession:
             return self.tilts.delay_s
         return max(self.tilts.delay_s, now.waiting_s - self._backlog.first.since_s)
 
-    def receive_gnss(self, message: Any, now: Now) -> list[Output]:
-        """Take a sensor_msgs/NavSatFix of GNSS; nothing is done with it without gnss.use."""
-        if self.gnss is not None:
-            self.gnss.receive(message, now)
-        return self.at(now)
-
-    def receive_trails(self, message: Any, now: Now) -> list[Output]:
-        """Take a TrailArray; nothing is done with it without satellites.elements."""
-        made = self._begun(now)
-        if self.satellites is not None:
-            self.satellites.receive(message)
-        return made + self._work(now)
-
     def at(self, now: Now) -> list[Output]:
         """Go on to a time."""
         self._advance(now)
@@ -301,7 +301,7 @@ class SolverSession:
                 return made
             # After a stall the frame's own tilts may be among them.
             for message, sent in self._arrived():
-                self._receive_tilt(message, sent, now)
+                self._take_tilt(message, now, sent)
             made += self._solve(self._backlog.pop(now.waiting_s).dated(now), now)
         self._backlog.pause()
         return made
