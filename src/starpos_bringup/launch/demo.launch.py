@@ -18,7 +18,7 @@ from launch.actions import ExecuteProcess
 from launch_ros.substitutions import ExecutableInPackage
 
 from starpos_bringup.launch_arguments import number
-from starpos_bringup.launching import Common, dashboard, described, process
+from starpos_bringup.launching import dashboard, described, process
 
 # deg
 POINTING = {"latitude": (-90, 90), "longitude": (-180, 360), "azimuth": (-360, 360), "altitude": (5, 90)}
@@ -51,7 +51,6 @@ def nodes(told):
     folder = tempfile.mkdtemp(prefix="starpos_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     link = os.path.join(folder, "inclinometer")
-    common = Common.of(told)
     simulated = {f"simulated.{name}": value for name, value in (place | AIR).items()} | {
         "simulated.roll": roll_deg
     }
@@ -66,10 +65,10 @@ def nodes(told):
     return [
         # The emulator is a device, not a node.
         ExecuteProcess(cmd=device, name="emulator", output="screen"),
-        process("starpos_inclinometer", "inclinometer", common, {"inclinometer": {"port": link}}),
-        process("starpos_camera", "camera_detector", common, {"camera": camera}),
-        process("starpos_solver", "solver", common, {"solver": solver}),
-        *dashboard(told, common),
+        process("starpos_inclinometer", "inclinometer", told, {"inclinometer": {"port": link}}),
+        process("starpos_camera", "camera_detector", told, {"camera": camera}),
+        process("starpos_solver", "solver", told, {"solver": solver}),
+        *dashboard(told),
     ]
 
 

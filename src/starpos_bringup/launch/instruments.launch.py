@@ -8,8 +8,6 @@ left_starpos_link and so on,
 unless the file names others: tf knows no namespaces.
 """
 
-from dataclasses import replace
-
 from launch.actions import GroupAction
 from launch_ros.actions import PushRosNamespace
 
@@ -24,12 +22,11 @@ FRAMES = {
 
 
 def nodes(told):
-    common = launching.Common.of(told)
     groups = []
     for name in names(told, "instruments"):
         frames = {node: {"frame_id": f"{name.replace('/', '_')}_{frame}"} for node, frame in FRAMES.items()}
         # security's policies are of one namespace each
-        own = replace(common, enclaves=f"{common.enclaves}/{name}")
+        own = {**told, "enclaves": f"{told['enclaves'].rstrip('/')}/{name}"}
         groups.append(
             GroupAction(
                 [PushRosNamespace(name), *launching.instrument(own, launching.clock_of(told), frames)]

@@ -29,17 +29,16 @@ def nodes(told):
     bag = Path(told["bag"]).expanduser()
     if not bag.exists():
         raise LaunchError(f"bag:={bag}: there is no such bag")
-    common = launching.Common.of(told)
-    processes = [launching.process("starpos_solver", "solver", common, SIMULATED)]
+    processes = [launching.process("starpos_solver", "solver", told, SIMULATED)]
     inputs = "stars"
     if is_true(told, "detector"):
-        processes.append(launching.process("starpos_camera", "detector", common, SIMULATED))
+        processes.append(launching.process("starpos_camera", "detector", told, SIMULATED))
         inputs = "images"
     player = ["--rate", f"{rate:g}", "--inputs", inputs, "--", str(bag)]
     return [
         *processes,
-        *launching.dashboard(told, common, SIMULATED),
-        launching.process("starpos_bringup", "replay", common, arguments=player, on_exit=over),
+        *launching.dashboard(told, SIMULATED),
+        launching.process("starpos_bringup", "replay", told, arguments=player, on_exit=over),
     ]
 
 

@@ -11,15 +11,15 @@ from starpos_bringup import launching
 
 
 def nodes(told):
-    common, every = launching.Common.of(told), launching.clock_of(told)
+    every = launching.clock_of(told)
     camera_info, imu = {"camera/camera_info": told["camera_info"]}, {"imu/data": told["imu"]}
     frames = {"camera/image_raw": told["image"], **camera_info, **imu}
     source = every | {"inclinometer": {"source": "imu"}}
     return [
-        launching.process("starpos_camera", "detector", common, every, remaps=frames),
-        launching.process("starpos_inclinometer", "inclinometer", common, source, remaps=imu),
-        launching.process("starpos_solver", "solver", common, every, remaps=camera_info | imu),
-        *launching.dashboard(told, common, every),
+        launching.process("starpos_camera", "detector", told, every, remaps=frames),
+        launching.process("starpos_inclinometer", "inclinometer", told, source, remaps=imu),
+        launching.process("starpos_solver", "solver", told, every, remaps=camera_info | imu),
+        *launching.dashboard(told, every),
     ]
 
 

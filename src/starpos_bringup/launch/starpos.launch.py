@@ -13,11 +13,11 @@ from starpos_bringup.launch_arguments import is_true
 def nodes(told):
     source = {"source": told["camera"]} if told["camera"] else {}
     port = {"port": told["port"]} if told["port"] else {}
-    common, every = launching.Common.of(told), launching.clock_of(told)
-    processes = launching.instrument(common, every | {"camera": source, "inclinometer": port})
+    every = launching.clock_of(told)
+    processes = launching.instrument(told, every | {"camera": source, "inclinometer": port})
     if is_true(told, "navigator"):
-        processes.append(launching.process("starpos_solver", "navigator", common, every))
-    return [*processes, *launching.dashboard(told, common, every)]
+        processes.append(launching.process("starpos_solver", "navigator", told, every))
+    return [*processes, *launching.dashboard(told, every)]
 
 
 def generate_launch_description():

@@ -5,7 +5,6 @@ import atexit
 import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,29 +28,6 @@ OUTPUTS = ("fix", "fix_averaged", "heading/imu")
 # The variable until Jazzy, and the one after it.
 PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 QUICK_START = PathJoinSubstitution([FindPackageShare("starpos_bringup"), "config", "quick_start.xml"])
-
-
-@dataclass(frozen=True)
-class Common:
-    """Settings that all processes of a launch share."""
-
-    params_file: str
-    log_level: str
-    enclaves: str
-    respawn: bool = False
-    outputs: str = ""
-
-    @classmethod
-    def of(cls, told: Mapping[str, str]) -> "Common":
-        """Make them from the arguments; LaunchError if there is no such parameter file or level."""
-        # launch_ros only warns of a missing file, and the instrument would run with defaults.
-        path = Path(told["params_file"]).expanduser()
-        if not path.is_file():
-            raise LaunchError(f"params_file:={told['params_file']}: there is no such file")
-        respawn = is_true(told, "respawn") if "respawn" in told else False
-        level = one_of(told, "log_level", LOG_LEVELS)
-        outputs = names(told, "outputs")[0] if told["outputs"] else ""
-        return cls(str(path), level, told["enclaves"].rstrip("/"), respawn, outputs)
 
 
 def described(
@@ -85,10 +61,10 @@ def clock_of(told: Mapping[str, str]) -> dict[str, dict[str, bool]]:
     return {"**": {"use_sim_time": is_true(told, "use_sim_time")} if told["use_sim_time"] else {}}
 
 
-def dashboard(told: Mapping[str, str], common: Common, parameters: Mapping[str, Mapping] = {}) -> list[Node]:
+def dashboard(told: Mapping[str, str], parameters: Mapping[str, Mapping] = {}) -> list[Node]:
     """Make the process of the web page, if it is wanted."""
     wanted = is_true(told, "dashboard")
-    return [process("starpos_dashboard", "dashboard", common, parameters)] if wanted else []
+    return [process("starpos_dashboard", "dashboard", told, parameters)] if wanted else []
 
 
 # Package, executable and nodes of each process of an instrument; camera and detector are one.
@@ -100,7 +76,7 @@ INSTRUMENT = (
 
 
 def instrument(
-    common: Common, parameters: Mapping[str, Mapping] = {}, defaults: Mapping[str, Mapping] = {}
+    told: Mapping[str, str], parameters: Mapping[str, Mapping] = {}, defaults: Mapping[str, Mapping] = {}
 ) -> list[Node]:
     """Make the processes of an instrument; parameters and defaults of its nodes as in `process`."""
 
@@ -108,7 +84,7 @@ def instrument(
         return {name: values for name, values in every.items() if name in ("**", *nodes)}
 
     return [
-        process(package, executable, common, of(nodes, parameters), defaults=of(nodes, defaults))
+        process(package, executable, told, of(nodes, parameters), defaults=of(nodes, defaults))
         for package, executable, nodes in INSTRUMENT
     ]
 
@@ -116,27 +92,32 @@ def instrument(
 def process(
     package: str,
     executable: str,
-    common: Common,
+    told: Mapping[str, str],
     parameters: Mapping[str, Mapping] = {},
     arguments: Sequence[str] = (),
     defaults: Mapping[str, Mapping] = {},
     remaps: Mapping[str, str] = {},
     **options: Any,
 ) -> Node:
-    """Make a process.
+    """Make a process; LaunchError if an argument is wrong.
 
+    told: the values of the launch file's arguments.
     parameters, defaults: of its nodes, by name ('**' is all); the parameter file counts less than parameters, more
     than defaults.  remaps: topics by the names that the nodes know them by.
     """
     renamed = [word for name, topic in remaps.items() for word in ("-r", f"{name}:={topic}")]
-    files = [_written(defaults), common.params_file, _written(parameters)]
+    # launch_ros only warns of a missing file, and the instrument would run with defaults
+    file = Path(told["params_file"]).expanduser()
+    if not file.is_file():
+        raise LaunchError(f"params_file:={told['params_file']}: there is no such file")
+    files = [_written(defaults), str(file), _written(parameters)]
     return Node(
         package=package,
         executable=executable,
         parameters=[file for file in files if file],
-        arguments=[*arguments, *ros_arguments(executable, common), *renamed],
+        arguments=[*arguments, *ros_arguments(executable, told), *renamed],
         output="screen",
-        respawn=common.respawn,
+        respawn="respawn" in told and is_true(told, "respawn"),
         respawn_delay=RESPAWN_DELAY_S,
         additional_env=profile(),
         **options,
@@ -148,13 +129,12 @@ def profile() -> dict[str, PathJoinSubstitution]:
     return {} if any(name in os.environ for name in PROFILES) else dict.fromkeys(PROFILES, QUICK_START)
 
 
-def ros_arguments(executable: str, common: Common) -> list[str]:
+def ros_arguments(executable: str, told: Mapping[str, str]) -> list[str]:
     """Make the arguments for ROS; the enclave is only a name while security is not enabled (ROS_SECURITY_ENABLE)."""
-    enclave = f"{common.enclaves}/{executable}"
-    remaps = [
-        word for name in OUTPUTS if common.outputs for word in ("-r", f"{name}:={common.outputs}/{name}")
-    ]
-    return ["--ros-args", "--log-level", common.log_level, "--enclave", enclave, *remaps]
+    enclave = f"{told['enclaves'].rstrip('/')}/{executable}"
+    outputs = names(told, "outputs")[:1] if told["outputs"] else []
+    remaps = [word for below in outputs for name in OUTPUTS for word in ("-r", f"{name}:={below}/{name}")]
+    return ["--ros-args", "--log-level", one_of(told, "log_level", LOG_LEVELS), "--enclave", enclave, *remaps]
 
 
 def _written(parameters: Mapping[str, Mapping]) -> str:

@@ -5,8 +5,9 @@ The QoS of each topic is in the parameters `qos_overrides.TOPIC...`.
 """
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -20,7 +21,6 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from starpos.parameters.table import ParameterError
 
 MAX_DEPTH = 100_000
-T = TypeVar("T")
 # A message, and the middleware's information on it.
 Take = Callable[[Any, Mapping[str, Any]], object]
 
@@ -32,11 +32,8 @@ def publisher(node: Node, kind: type, topic: str, depth: int, latched: bool = Fa
     """
     durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
     qos = QoSProfile(depth=depth, durability=durability)
-
-    def make() -> Publisher:
+    with _overridden(node, topic):
         return node.create_publisher(kind, topic, qos, qos_overriding_options=_options())
-
-    return _made(node, topic, make)
 
 
 def subscription(
@@ -55,13 +52,10 @@ def subscription(
     """
     # rclpy writes the overrides into the profile: a shared profile would carry them to the next topic.
     qos = QoSProfile(depth=depth, reliability=reliability)
-
-    def make() -> Subscription:
+    with _overridden(node, topic):
         return node.create_subscription(
             kind, topic, callback, qos, raw=raw, event_callbacks=events, qos_overriding_options=_options()
         )
-
-    return _made(node, topic, make)
 
 
 def subscription_from_any(node: Node, kind: type, topic: str, callback: Take, depth: int) -> None:
@@ -102,9 +96,10 @@ def _checked(qos: QoSProfile) -> QosCallbackResult:
     return result
 
 
-def _made(node: Node, topic: str, make: Callable[[], T]) -> T:
+@contextmanager
+def _overridden(node: Node, topic: str) -> Iterator[None]:
     try:
-        return make()
+        yield
     except RCLError:
         raise
     except (RuntimeError, InvalidQosOverridesError) as error:

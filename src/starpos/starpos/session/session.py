@@ -251,9 +251,9 @@ class SolverSession:
 
     def _delay_s(self, now: Now) -> float:
         """For how long frames wait for their tilts, by the tilts that have come, and by the first frame."""
-        if not self._backlog or self._ready(self._backlog.first, now):
+        if not self._backlog or self._ready(self._backlog[0], now):
             return self.tilts.delay_s
-        return max(self.tilts.delay_s, now.waiting_s - self._backlog.first.since_s)
+        return max(self.tilts.delay_s, now.waiting_s - self._backlog[0].since_s)
 
     def at(self, now: Now) -> list[Output]:
         """Go on to a time."""
@@ -302,20 +302,20 @@ class SolverSession:
             # After a stall the frame's own tilts may be among them.
             for message, sent in self._arrived():
                 self._take_tilt(message, now, sent)
-            made += self._solve(self._backlog.pop(now.waiting_s).dated(now), now)
+            made += self._solve(self._backlog.take(now.waiting_s).dated(now), now)
         self._backlog.pause()
         return made
 
     def _first_ready(self, now: Now) -> bool:
         if self._backlog:
-            self.instrument.advance_to(self._backlog.first.stars.mid_unix_s)
-        return bool(self._backlog) and self._ready(self._backlog.first, now)
+            self.instrument.advance_to(self._backlog[0].stars.mid_unix_s)
+        return bool(self._backlog) and self._ready(self._backlog[0], now)
 
     def _ready(self, frame: Waiting, now: Now) -> bool:
         if self.instrument.preparing:
             return False
         if math.isnan(frame.since_s):
-            frame = self._backlog.first = replace(frame, since_s=now.waiting_s)
+            frame = self._backlog[0] = replace(frame, since_s=now.waiting_s)
         mid, waited_s = frame.stars.mid_unix_s, now.waiting_s - frame.since_s
         # a negative wait: the clock has begun anew
         if mid is None or self._ended or waited_s > self.tilts.patience_s or waited_s < 0:
