@@ -119,7 +119,7 @@ class Bag(BagReader):
             of_tilt = () if any(name.endswith("/tilt") for name in names) else (IMU_DATA,)
             ends = tuple("/" + relative for relative in (needed, *others, *of_tilt))
             return [name for name in names if name.endswith(ends)]
-        found = driver_topics(self.connections, remaps, place=self.path) if needed == RAW else {}
+        found = driver_topics(self, remaps) if needed == RAW else {}
         if not found:
             raise BagError(f"{self.path}: no topic {needed} in it; it has {', '.join(map(repr, names))}")
         return sorted(found.values())
