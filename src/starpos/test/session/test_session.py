@@ -352,20 +352,10 @@ def test_gnss_without_a_fix_is_no_place(messages, begin_s):
     assert answer.solution.at_place is None
 
 
-def test_without_gnss_use_messages_of_gnss_change_no_answer(messages, begin_s):
-    stars, came_s = first(messages, STARS)
-    answers = []
-    for given in (False, True):
-        told = seen_at(messages, begin_s)
-        for tilt, _ in tilts_of(messages, came_s + 5.0):
-            told.tell(TILT, tilt, came_s)
-        if given:
-            told.session.receive(NAV_SAT_FIX, gnss_fix(stars, latitude=10.0), Now.in_data(came_s))
-        [answer, *_] = told.tell(STARS, stars, came_s)
-        assert answer.solution.ok and answer.compared is None
-        fix = answer.solution.fix
-        answers.append((fix.latitude, fix.longitude, fix.covariance.tobytes(), answer.ground.latitude))
-    assert answers[0] == answers[1] and told.session.gnss is None
+def test_gnss_is_an_input_with_gnss_use_alone():
+    without = Told().session
+    assert without.inputs == INPUTS and without.gnss is None
+    assert Told("gnss.use:=true").session.inputs == INPUTS | {"gnss/fix": NAV_SAT_FIX}
 
 
 @pytest.mark.parametrize(
