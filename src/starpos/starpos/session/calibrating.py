@@ -63,27 +63,24 @@ class _Pose:
         self.tilts.append(seen.tilt)
 
 
-class PoseMemory:
+class PoseMemory(deque[_Pose]):
     """Keeps each pose's last frame with the mean tilt of the pose; drops the oldest poses."""
 
     def __init__(self) -> None:
-        self._poses: deque[_Pose] = deque(maxlen=MAX_POSES)
-
-    def __len__(self) -> int:
-        return len(self._poses)
+        super().__init__(maxlen=MAX_POSES)
 
     def keep(self, seen: Seen, fix: Fix) -> bool:
         """Keep a frame; return whether a new calibration is worthwhile: a new pose, or one with twice as many frames."""
-        if not self._poses or slip_s(fix.camera, self._poses[-1].first.camera, fix.latitude) != 0:
-            self._poses.append(_Pose(fix, seen))
-        pose = self._poses[-1]
+        if not self or slip_s(fix.camera, self[-1].first.camera, fix.latitude) != 0:
+            self.append(_Pose(fix, seen))
+        pose = self[-1]
         pose.keep(seen)
         return pose.frames & (pose.frames - 1) == 0
 
     def frames(self) -> list[Seen]:
         """Return a frame for each pose whose tilts agree, the oldest first."""
         made = []
-        for pose in self._poses:
+        for pose in self:
             try:
                 made.append(replace(pose.newest, tilt=mean_tilt(pose.tilts)))
             except TiltError:
@@ -93,11 +90,8 @@ class PoseMemory:
 
     def forget_before(self, utc_unix_s: float) -> None:
         """Drop the poses before that time, because the instrument has moved then."""
-        while self._poses and self._poses[0].newest.mid_unix_s < utc_unix_s:
-            self._poses.popleft()
-
-    def clear(self) -> None:
-        self._poses.clear()
+        while self and self[0].newest.mid_unix_s < utc_unix_s:
+            self.popleft()
 
 
 def mean_tilt(tilts: Sequence[Tilt]) -> Tilt:
@@ -203,8 +197,8 @@ class Calibrating:
         self._newest_unix_s = self._late_unix_s = -math.inf
         # Number of frames in a row that are older than the newest, each younger than the one before.
         self._late = 0
-        # Standard deviation of the plumb line in `found`; nan: not known.
-        self._plumb_arcsec = math.nan
+        # What `found` with its error comes from; None where that is no frames.
+        self._calibrated: Calibrated | None = None
         # Grows when the instrument or the place changes; a job of an older era is out of date.
         self._era = 0
         self._worker = jobs
@@ -212,8 +206,6 @@ class Calibrating:
         self._asked = False
         # Whether to calibrate by itself again when there is time.
         self._again = False
-        # A sentence about `found`.
-        self._about = ""
         # Why the last calibration by itself was not taken.
         self._said = ""
 
@@ -225,17 +217,12 @@ class Calibrating:
     @property
     def about(self) -> str:
         """A sentence about the calibration that was found; '' without one."""
-        return self._about
+        return _about(self._calibrated) if self._calibrated else ""
 
     @property
     def unknown(self) -> bool:
         """Whether A3 is not known, so that fixes carry its error."""
-        return not self._is_found and self._settings.instrument(self.found).calibration.unknown
-
-    @property
-    def _is_found(self) -> bool:
-        """Whether A3 and its error come from frames."""
-        return not math.isnan(self._plumb_arcsec)
+        return self._calibrated is None and self._settings.instrument(self.found).calibration.unknown
 
     # events of the session ----------------------------------------------------------------------------------------------
 
@@ -254,10 +241,10 @@ class Calibrating:
             return False
         news = self.average.include(fix)
         # While A3 is not known, turning looks like moving.
-        if self._is_found and news is News.MOVED:
+        if self._calibrated and news is News.MOVED:
             self._era += 1
             self._poses.forget_before(self.average.began_unix_s)
-        if self._is_found and news is News.LEFT_OUT:
+        if self._calibrated and news is News.LEFT_OUT:
             return False
         worthwhile = self._poses.keep(seen, fix)
         if self._values["self_calibration"] and (worthwhile or self._again):
@@ -310,15 +297,12 @@ class Calibrating:
 
     def _drop(self, instead: Calibration | None) -> None:
         self._era += 1
-        self.found, self._plumb_arcsec = instead, math.nan
-        self._about = self._said = ""
+        self.found, self._calibrated, self._said = instead, None, ""
 
     def _adopt(self, calibrated: Calibrated) -> None:
         self._era += 1
-        self.found = calibrated.instrument.calibration
-        self._plumb_arcsec = calibrated.plumb_stddev_arcsec
-        self._about = _about(calibrated)
-        self._log.info(self._about)
+        self.found, self._calibrated = calibrated.instrument.calibration, calibrated
+        self._log.info(self.about)
         self.average.begin_anew()
         self._changed()
 
@@ -401,7 +385,7 @@ class Calibrating:
             self._said = said
             if not said:
                 self._adopt_turned(outcome.value)
-            elif outcome.trouble and self._is_found:
+            elif outcome.trouble and self._calibrated:
                 # The newest heading does not fit the others: the place has changed.
                 self._moved_on(self._newest_unix_s)
         if self._again:
@@ -428,14 +412,13 @@ class Calibrating:
 
         The zero of the inclinometer drifts, so the calibration in use gets worse with time.
         """
-        if self.found is None or not self._is_found:
+        if (before := self._calibrated) is None:
             return True
-        now = calibrated.instrument.calibration.utc_unix_s
-        hours = abs(now - self.found.utc_unix_s) / 3600
-        drift = np.degrees(calibrated.instrument.inclinometer.drift_rad_per_sqrt_hour) * 3600
-        return calibrated.plumb_stddev_arcsec < BETTER * math.hypot(
-            self._plumb_arcsec, drift * math.sqrt(hours)
-        )
+        found, known = calibrated.instrument, before.instrument
+        hours = abs(found.calibration.utc_unix_s - known.calibration.utc_unix_s) / 3600
+        drift = np.degrees(found.inclinometer.drift_rad_per_sqrt_hour) * 3600
+        now_arcsec = math.hypot(before.plumb_stddev_arcsec, drift * math.sqrt(hours))
+        return calibrated.plumb_stddev_arcsec < BETTER * now_arcsec
 
     def _adopt_turned(self, turned: Turned) -> None:
         self._adopt(turned.calibrated)
@@ -467,14 +450,15 @@ class Calibrating:
         values: dict[str, object] = {"frames kept": len(self._recent), "headings": len(self._poses)}
         values |= {"self-calibration": self._values["self_calibration"], "working": self._worker.busy}
         values |= {"last turn on the spot": self._said}
-        if self._is_found and self.found is not None:
-            values |= {"plumb line (arcsec)": self._plumb_arcsec, "found of frames": self.found.frames}
+        if (found := self._calibrated) is not None:
+            frames = found.instrument.calibration.frames
+            values |= {"plumb line (arcsec)": found.plumb_stddev_arcsec, "found of frames": frames}
         if self.unknown:
             remedy = (self._said or TURN_IT) if self._values["self_calibration"] else CALIBRATE_IT
             return Diagnosis(
                 Level.WARN, f"the misalignment of camera and inclinometer is not known: {remedy}", values
             )
-        return Diagnosis(Level.OK, self._about or "from the parameters", values)
+        return Diagnosis(Level.OK, self.about or "from the parameters", values)
 
 
 @coroutine
