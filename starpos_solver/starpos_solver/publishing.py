@@ -85,7 +85,14 @@ class Transforms:
 
     @cached_property
     def _possible(self) -> bool:
-        return _can_be_told(self._node, self._topic)
+        """Whether there are messages of tf; said in the log if not. Looking takes longer than a fix: it is done once."""
+        if find_spec("tf2_msgs") is not None:
+            return True
+        self._node.get_logger().info(
+            f"tf2_msgs is not installed, so there is no {self._topic}: sudo apt install ros-jazzy-tf2-msgs, or set "
+            "publish_tf to false"
+        )
+        return False
 
     def publish(self, transforms: list[TransformStamped]) -> None:
         """Publish them if the topic is open."""
@@ -118,17 +125,6 @@ class StaticTransforms(Transforms):
             for message in stamped:
                 message.header.stamp = self._node.get_clock().now().to_msg()
             self.publish(stamped)
-
-
-def _can_be_told(node: Node, topic: str) -> bool:
-    """Whether there are messages of tf; says in the log if not. Looking takes longer than a fix: ask once."""
-    if find_spec("tf2_msgs") is not None:
-        return True
-    node.get_logger().info(
-        f"tf2_msgs is not installed, so there is no {topic}: sudo apt install ros-jazzy-tf2-msgs, or set publish_tf to "
-        "false"
-    )
-    return False
 
 
 class SolutionPublishers:
