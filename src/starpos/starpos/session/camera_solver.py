@@ -116,18 +116,12 @@ class CameraSolver:
 
     def _begin(self, camera: Camera | str) -> None:
         """Use a camera, or none, for the reason given."""
-        if isinstance(camera, Camera):
-            self._use(camera)
-            return
-        known, self.camera, self.solver, self.trouble = self.camera, None, None, camera
-        if known is not None:
+        before, self.solver = self.camera, None
+        self.camera, self.trouble = (camera, "") if isinstance(camera, Camera) else (None, camera)
+        if before != self.camera:
             self._changed()
-
-    def _use(self, camera: Camera) -> None:
-        self.camera, self.solver, self.trouble = camera, None, ""
-        self._changed()
-        if not self.preparing:
-            self._prepare(camera)
+        if self.camera is not None and not self.preparing:
+            self._prepare(self.camera)
 
     def _prepare(self, camera: Camera) -> None:
         """Prepare the triangles of this field as a job, because building them takes seconds."""

@@ -171,6 +171,15 @@ class TiltBuffer:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
+        # of the last message; '' before the first one
+        self.frame_id = ""
+        self.clear()
+
+    def __len__(self) -> int:
+        return len(self._good)
+
+    def clear(self) -> None:
+        """Forget all samples, and who has published them."""
         # Each with the number of its arrival.
         self._good: deque[tuple[int, Tilt]] = deque(maxlen=CAPACITY)
         self._came, self._latest_unix_s = 0, -np.inf
@@ -179,23 +188,8 @@ class TiltBuffer:
         # how late each of the newest came, and the time between it and the one before
         self._late_s: deque[float] = deque(maxlen=USUAL)
         self._apart_s: deque[float] = deque(maxlen=USUAL)
-        self._publishers = TiltPublishers()
         # those ahead of a clock that may have been heard only after them
         self._early: deque[Any] = deque(maxlen=MAX_EARLY)
-        # of the last message; '' before the first one
-        self.frame_id = ""
-
-    def __len__(self) -> int:
-        return len(self._good)
-
-    def clear(self) -> None:
-        self._good.clear()
-        self._flagged.clear()
-        self._steps.clear()
-        self._late_s.clear()
-        self._apart_s.clear()
-        self._early.clear()
-        self._latest_unix_s = -np.inf
         self.forget_publishers()
 
     def forget_publishers(self) -> None:
