@@ -21,6 +21,8 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from starpos.parameters.table import ParameterError
 
 MAX_DEPTH = 100_000
+# no warning of rclpy's where a publisher does not match
+SILENT = SubscriptionEventCallbacks(use_default_callbacks=False)
 # A message, and the middleware's information on it.
 Take = Callable[[Any, Mapping[str, Any]], object]
 
@@ -76,13 +78,11 @@ def subscription_from_any(node: Node, kind: type, topic: str, callback: Take, de
 
     # rclpy's types know callbacks of one argument only
     heard: Callable[..., None] = once
-    # a publisher that one of them does not match is no reason for its warning
-    silent = SubscriptionEventCallbacks(use_default_callbacks=False)
-    subscription(node, kind, topic, heard, depth, events=silent)
+    subscription(node, kind, topic, heard, depth, events=SILENT)
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     best_effort = QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
     for qos in (latched, best_effort):
-        node.create_subscription(kind, topic, heard, qos, event_callbacks=silent)
+        node.create_subscription(kind, topic, heard, qos, event_callbacks=SILENT)
 
 
 def _options() -> QoSOverridingOptions:
@@ -126,9 +126,7 @@ class MatchedSubscription:
         self._node, self._kind = node, kind
         # rclpy's types know callbacks of one argument only
         self._callback: Callable[..., Any] = callback
-        self._subscription = subscription(
-            node, kind, topic, callback, depth, events=SubscriptionEventCallbacks(use_default_callbacks=False)
-        )
+        self._subscription = subscription(node, kind, topic, callback, depth, events=SILENT)
         self.topic = self._subscription.topic_name
         self._qos: QoSProfile = self._subscription.qos_profile
         self._fixed = self._qos.reliability != RELIABLE
@@ -149,11 +147,7 @@ class MatchedSubscription:
         self._qos = QoSProfile(history=self._qos.history, depth=self._qos.depth, reliability=wanted)
         self.destroy()
         self._subscription = self._node.create_subscription(
-            self._kind,
-            self.topic,
-            self._callback,
-            self._qos,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            self._kind, self.topic, self._callback, self._qos, event_callbacks=SILENT
         )
         how = "best effort, as its publisher" if wanted == BEST_EFFORT else "reliably"
         self._node.get_logger().info(f"{self.topic} is heard {how}.")
