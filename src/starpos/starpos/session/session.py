@@ -88,9 +88,9 @@ class SolverSession:
         self.gyro = Gyro(heard)
         self.satellites: LiveSatellites | None = None
         if settings.orbits is not None:
-            from starpos.session import satellites as live
+            from starpos.session import satellites
 
-            self.satellites = live.LiveSatellites(settings, settings.orbits, jobs(), heard)
+            self.satellites = satellites.LiveSatellites(settings, settings.orbits, jobs(), heard)
         self.gnss: GnssTeacher | None = None
         if settings.values["gnss.use"]:
             self.gnss = GnssTeacher(settings, jobs(), heard, log, self.satellites)
@@ -101,8 +101,8 @@ class SolverSession:
         }
         if (gnss := self.gnss) is not None:
             self._take[NAV_SAT_FIX] = lambda message, now, sent: gnss.receive(message, now)
-        if (satellites := self.satellites) is not None:
-            self._take[TRAILS] = lambda message, now, sent: satellites.receive(message)
+        if (by_trails := self.satellites) is not None:
+            self._take[TRAILS] = lambda message, now, sent: by_trails.receive(message)
         self.places = SessionPlaces(settings, self.gnss, self.satellites)
         self.deflection = LiveDeflection(settings, jobs())
         self._search = Search(settings.values)
