@@ -152,9 +152,8 @@ def _newest_is_off(fixes: list[Fix]) -> bool:
 MIN_HEADINGS, MIN_BY_ITSELF = 3, 4
 TURN_IT = "turn it on the spot"
 CALIBRATE_IT = (
-    "fixes have errors of over 1000 km. Set calibration_url or misalignment_stddev, call solver/calibrate "
-    "at a known place, or "
-    "set self_calibration and turn it on the spot"
+    "fixes have errors of over 1000 km. Set calibration_url or misalignment_stddev, call solver/calibrate at a known "
+    "place, or set self_calibration and turn it on the spot"
 )
 # Number of old frames in a row, in order, that show that a bag is played again.
 LATE_FRAMES = 3
@@ -208,11 +207,6 @@ class Calibrating:
         self._again = False
         # Why the last calibration by itself was not taken.
         self._said = ""
-
-    @property
-    def busy(self) -> bool:
-        """Whether a calibration is being worked out."""
-        return self._worker.busy
 
     @property
     def about(self) -> str:
@@ -401,9 +395,8 @@ class Calibrating:
             )
         if not found <= limit:
             return (
-                f"the headings determine the plumb line in the camera to {found:.0f} arcsec only, "
-                f"self_calibration_limit is "
-                f"{limit:g}: turn the instrument further, or to more headings"
+                f"the headings determine the plumb line in the camera to {found:.0f} arcsec only, self_calibration_limit "
+                f"is {limit:g}: turn the instrument further, or to more headings"
             )
         return ""
 

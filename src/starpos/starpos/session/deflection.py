@@ -48,17 +48,7 @@ class LiveDeflection:
     @property
     def measures(self) -> bool:
         """Whether a deflection is measured."""
-        return not math.isnan(self.wanted_arcsec)
-
-    @property
-    def wanted_arcsec(self) -> float:
-        """The error that is enough; NaN where no deflection is measured."""
-        return float(self._settings.values["deflection.wanted"])
-
-    @property
-    def busy(self) -> bool:
-        """Whether an adjustment runs."""
-        return self._jobs.busy
+        return not math.isnan(self._settings.values["deflection.wanted"])
 
     def parameters_set(self, names: frozenset[str]) -> None:
         """Begin a new session where the mark, the instrument or the air has changed."""
@@ -98,7 +88,7 @@ class LiveDeflection:
             waiting = f"{len(self._sightings)} frames so far"
             said = self._trouble or self._left_out or "point the camera at the zenith"
             return Diagnosis(Level.WARN, f"{waiting}: {said}", {"frames": len(self._sightings)})
-        found, wanted = self._found, self.wanted_arcsec
+        found, wanted = self._found, self._settings.values["deflection.wanted"]
         sigma = float(found.sigma_arcsec.max())
         faces = int(found.faces.max()) + 1
         enough = sigma <= wanted and not self._trouble

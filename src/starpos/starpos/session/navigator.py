@@ -218,8 +218,7 @@ class NavigatorSession:
             raise VoyageError(f"{what} has no time stamp: set header.stamp to when it was measured")
         if now.ahead_s(unix_s) > AHEAD_S:
             raise VoyageError(
-                f"{what} is stamped {now.ahead_s(unix_s):.3g} s in the future: set the clocks of camera, "
-                f"IMU and "
+                f"{what} is stamped {now.ahead_s(unix_s):.3g} s in the future: set the clocks of camera, IMU and "
                 "navigator by one source"
             )
 

@@ -62,11 +62,6 @@ class LiveSatellites:
         self._taught = 0
         self._jobs.disown()
 
-    @property
-    def busy(self) -> bool:
-        """Whether a place is being computed."""
-        return self._jobs.busy
-
     # what comes -------------------------------------------------------------------------------------------------------
 
     def receive(self, message: Any) -> None:

@@ -77,6 +77,13 @@ class SolverSession:
         arrived_stars: Callable[[], Iterable[tuple[Any, Sent]]] = tuple,
         topic: str = CAMERA_TOPIC,
     ) -> None:
+        # the runners whose outcomes answers depend on
+        self._jobs: list[Jobs] = []
+
+        def waited_for() -> Jobs:
+            self._jobs.append(jobs())
+            return self._jobs[-1]
+
         self.latest: Waiting | None = None
         self.answer: Solution | None = None
         self.pace = Pace()
@@ -90,7 +97,7 @@ class SolverSession:
         if settings.orbits is not None:
             from starpos.session import satellites
 
-            self.satellites = satellites.LiveSatellites(settings, settings.orbits, jobs(), heard)
+            self.satellites = satellites.LiveSatellites(settings, settings.orbits, waited_for(), heard)
         self.gnss: GnssTeacher | None = None
         if settings.values["gnss.use"]:
             self.gnss = GnssTeacher(settings, jobs(), heard, log, self.satellites)
@@ -104,7 +111,7 @@ class SolverSession:
         if (by_trails := self.satellites) is not None:
             self._take[TRAILS] = lambda message, now, sent: by_trails.receive(message)
         self.places = SessionPlaces(settings, self.gnss, self.satellites)
-        self.deflection = LiveDeflection(settings, jobs())
+        self.deflection = LiveDeflection(settings, waited_for())
         self._search = Search(settings.values)
         self._glows = Glows()
         self._settings, self._values = settings, settings.values
@@ -122,12 +129,12 @@ class SolverSession:
         self.instrument = CameraSolver(
             self._make_solver,
             self._other_camera,
-            jobs(),
+            waited_for(),
             lambda why: self._changes.say(why, good=False),
             topic,
         )
         self.calibrating = Calibrating(
-            settings, jobs(), lambda: self.instrument.solver_now, self.instrument.remake, log
+            settings, waited_for(), lambda: self.instrument.solver_now, self.instrument.remake, log
         )
         if unnamed := unnamed_inclinometer(settings.instrument(None), MODEL_BY_PARAMETERS):
             log.warning(unnamed)
@@ -136,13 +143,17 @@ class SolverSession:
         return self._settings.solver(camera, self.calibrating.found, self._catalogue)
 
     def _other_camera(self) -> None:
-        self._hint = None
+        self._forget()
         self._search.other_camera()
         self._glows = Glows()
-        self.gyro.forget()
         if self.gnss is not None:
             self.gnss.other_camera()
         self.calibrating.camera_changed()
+
+    def _forget(self) -> None:
+        """Forget what is known by the camera's pose."""
+        self._hint = None
+        self.gyro.forget()
         if self.satellites is not None:
             self.satellites.forget()
         self.deflection.forget()
@@ -160,8 +171,7 @@ class SolverSession:
     @property
     def busy(self) -> bool:
         """Whether a job runs: what comes meanwhile may be answered with its outcome, or without."""
-        located = self.satellites is not None and self.satellites.busy
-        return located or self.instrument.preparing or self.calibrating.busy or self.deflection.busy
+        return any(jobs.busy for jobs in self._jobs)
 
     # parameters ------------------------------------------------------------------------------------------------------
 
@@ -471,15 +481,12 @@ class SolverSession:
         """Forget tilts, frames and the place, but no calibration that was found."""
         self.tilts.clear()
         self._backlog.clear()
-        self.latest = self.answer = self._hint = None
-        self.gyro.forget()
+        self.latest = self.answer = None
+        self._forget()
         if self.gnss is not None:
             self.gnss.places.forget()
-        if self.satellites is not None:
-            self.satellites.forget()
         self.doubt.clear()
         self.calibrating.forget()
-        self.deflection.forget()
 
 
 def _failed(frame: Waiting, what: str, error: Exception) -> Solution:
