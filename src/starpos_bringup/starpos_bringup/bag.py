@@ -121,8 +121,12 @@ class Bag(BagReader):
             return [name for name in names if name.endswith(ends)]
         found = driver_topics(self, remaps) if needed == RAW else {}
         if not found:
-            raise BagError(f"{self.path}: no topic {needed} in it; it has {', '.join(map(repr, names))}")
+            raise self._without(needed)
         return sorted(found.values())
+
+    def _without(self, name: str) -> BagError:
+        known = ", ".join(sorted({repr(c.topic) for c in self.connections}))
+        return BagError(f"{self.path}: no topic {name} in it; it has {known}")
 
     def topics(self, wanted: list[str] | None, left_out: Callable[[str], None]) -> dict[int, Topic]:
         """Find the topics that can be played, by connection; `left_out` gets a sentence for each other topic.
@@ -132,9 +136,7 @@ class Bag(BagReader):
         names = {c.topic for c in self.connections}
         for name in wanted or ():
             if name not in names:
-                raise BagError(
-                    f"{self.path}: no topic {name} in it; it has {', '.join(sorted(map(repr, names)))}"
-                )
+                raise self._without(name)
         topics = {}
         for c in self.connections:
             if c.topic == "/clock" or (wanted and c.topic not in wanted):

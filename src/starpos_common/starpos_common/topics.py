@@ -205,7 +205,6 @@ class Dropped:
     def __init__(self, node: Node, cure: str) -> None:
         self._node, self._cure = node, cure
         self.counts: dict[str, int] = {}
-        self._warned: set[str] = set()
         self._last: dict[str, int] = {}
 
     def came(self, name: str, info: Mapping[str, Any]) -> None:
@@ -216,15 +215,10 @@ class Dropped:
         last = self._last.get(name)
         self._last[name] = number
         # a lower number comes from another publisher
-        if last is not None and number - last > 1:
-            self._note_missing(name, number - last - 1)
-
-    def _note_missing(self, name: str, missing: int) -> None:
-        topic = self._node.resolve_topic_name(name)
-        if self._node.count_publishers(topic) > 1:
+        missing = 0 if last is None else number - last - 1
+        if missing <= 0 or self._node.count_publishers(topic := self._node.resolve_topic_name(name)) > 1:
             return
-        if name not in self._warned:
-            self._warned.add(name)
+        if name not in self.counts:
             self._node.get_logger().warning(
                 f"{topic}: {missing} messages were dropped on the way: {self._cure}"
             )
