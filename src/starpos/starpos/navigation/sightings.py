@@ -69,7 +69,7 @@ class IdentifiedFrame(FrameUnderWay):
         there = seen_problem(self.xy, self.optics, stronger).predict(fit.a4, fit.scale)
         shift = (there - self.xy - fit.residual)[fit.kept] / STEP_REFRACTION
         # the camera turns the other way than the sky in it
-        return _camera_of(seen, -seen.errors.rotated(shift))
+        return _camera_of(seen, -seen.rotated(shift))
 
     def placeless(self) -> Attitude:
         """Fit attitude and plate scale where no zenith is known: refraction and diurnal aberration stay in it."""
@@ -87,7 +87,7 @@ def _camera_of(seen: StarFit, by_refraction: np.ndarray) -> Attitude:
     """The camera's attitude by a fit; by_refraction (3,): about C's axes."""
     own = Attitude(
         np.eye(3),
-        seen.errors.rotation_covariance(seen.errors.centroids),
+        seen.own,
         of=CAMERA,
         into=CAMERA,
         by_refraction=by_refraction,
