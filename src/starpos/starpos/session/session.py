@@ -112,7 +112,8 @@ class SolverSession:
             self._take[TRAILS] = lambda message, now, sent: by_trails.receive(message)
         self.places = SessionPlaces(settings, self.gnss, self.satellites)
         self.deflection = LiveDeflection(settings, waited_for())
-        self._search, self._glows = Search(settings.values), Glows()
+        self._search = Search(settings.values)
+        self._glows = Glows()
         self._settings, self._values = settings, settings.values
         self._catalogue = catalogue.load_catalogue()
         # This reads the tables of the Earth's rotation, so that the first frame is not slow.
@@ -143,7 +144,8 @@ class SolverSession:
 
     def _other_camera(self) -> None:
         self._forget()
-        self._search, self._glows = Search(self._values), Glows()
+        self._search.other_camera()
+        self._glows = Glows()
         if self.gnss is not None:
             self.gnss.other_camera()
         self.calibrating.camera_changed()

@@ -26,13 +26,17 @@ AT_ONCE_S = 0.0
 
 
 class Search:
-    """Solves the frames of a camera, and ends with each in time; values: the parameters."""
+    """Solves frames, and ends with each in time; values: the parameters."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
         # since the last frame, and when that came, by the clock in which waiting is counted
         self._interval_s, self._came_s = math.inf, -math.inf
-        # whether a frame was identified
+        self.other_camera()
+
+    def other_camera(self) -> None:
+        """Note that the camera is another one."""
+        # whether a frame of this camera was identified
         self._identified = False
 
     def note_frame(self, now: Now) -> None:
