@@ -147,7 +147,6 @@ class SolutionPublishers:
         return self._fix, self._imu
 
     def publish(self, output: Output) -> None:
-        """Publish a session's results."""
         header = self._header(output.stamp)
         if isinstance(output, Averaged):
             self._fix_averaged.publish(self._nav_sat_fix(header, output.ground))
@@ -169,7 +168,6 @@ class SolutionPublishers:
         self._solution.publish(self.solution(output))
 
     def solution(self, answered: Answered) -> msg.Solution:
-        """Make the message of a solution."""
         message = outputs.solution(self._header(answered.stamp), answered.solution, answered.ground)
         if answered.no_camera:
             message.status = msg.Solution.NO_CAMERA

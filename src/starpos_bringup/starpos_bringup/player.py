@@ -164,7 +164,6 @@ class Player:
         return time.monotonic() - self._unchanged_since_s >= SETTLED_S
 
     def start_round(self) -> None:
-        """Begin to play from the beginning."""
         self._now_ns, self._ticked_ns = None, 0
         self._first_ns: int | None = None
         self._begin_s = time.monotonic()
@@ -292,7 +291,6 @@ class Player:
             self._say(f"{(self._now_ns - self._first_ns) * 1e-9:.0f} s of the bag, {self.count} messages")
 
     def close(self) -> None:
-        """End the nodes."""
         self._executor.shutdown()
         self._node.destroy_node()
         self._frame_node.destroy_node()

@@ -21,7 +21,6 @@ SAVED, BROKEN_OFF, REFUSED = 0, 1, 2
 
 
 def record() -> int:
-    """Run the executable."""
     from starpos_common.node_main import own_arguments, run
 
     options = parser_of("record").parse_args(own_arguments(sys.argv[1:])[0])
@@ -55,7 +54,6 @@ def say(sentence: str) -> None:
 
 
 def folder() -> int:
-    """Run the executable."""
     from starpos_common.node_main import own_arguments, run
 
     path = parser_of("folder").parse_args(own_arguments(sys.argv[1:])[0]).folder

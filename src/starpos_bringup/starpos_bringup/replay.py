@@ -30,7 +30,6 @@ WAIT_S, WAIT_FOR_INPUTS_S = 3.0, 30.0
 
 
 def replay() -> int:
-    """Run the executable."""
     with stop_signals() as stopped:
         return main(sys.argv[1:], stopped)
 

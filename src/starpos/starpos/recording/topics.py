@@ -96,7 +96,6 @@ def _topic_of(
 
 
 def sentence_on_use(found: Mapping[str, str], connections: "Sequence[Connection]") -> str:
-    """Sentence on the use of the topics that were found."""
     kinds = {c.topic: c.msgtype for c in connections}
     made = [f"{MADE_OF[kinds[t]]} from {t}" for t in found.values() if kinds[t] in MADE_OF]
     plain = [f"{name} is {t}" for name, t in found.items() if kinds[t] not in MADE_OF]

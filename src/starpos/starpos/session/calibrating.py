@@ -43,7 +43,6 @@ class Seen:
 
     @property
     def mid_unix_s(self) -> float:
-        """Middle of the exposure."""
         assert self.stars.mid_unix_s is not None
         return self.stars.mid_unix_s
 

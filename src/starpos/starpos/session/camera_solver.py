@@ -21,7 +21,6 @@ class CameraSolver:
     make: makes the Solver for a camera with the present parameters and calibration; it may raise a StarposError.
     changed: called when the camera is another one.  say: takes a sentence about why there is no Solver, or what the
     catalogue lacks for it.
-    topic: full name of the topic of the camera's intrinsics.
     """
 
     def __init__(

@@ -94,7 +94,6 @@ class RecentPlaces:
         return GnssTrack(self._places[first : self._first_since(utc_unix_s + NEAREST_S) + 1]).at(utc_unix_s)
 
     def forget(self) -> None:
-        """Forget all places."""
         self._places.clear()
 
     def _first_since(self, utc_unix_s: float) -> int:

@@ -125,7 +125,6 @@ class Replay:
 
 
 def _tilt_message(log: TiltLog, k: int) -> Reading:
-    """The message of a reading."""
     z, variance_z = (math.nan if c is None else float(c[k]) for c in (log.theta_z, log.variance_z))
     return Reading(
         stamp_ns=round(float(log.utc_unix_s[k]) * 1e9),

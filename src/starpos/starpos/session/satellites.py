@@ -65,7 +65,6 @@ class LiveSatellites:
     # what comes -------------------------------------------------------------------------------------------------------
 
     def receive(self, message: Any) -> None:
-        """Take a TrailArray."""
         with refusing(self._heard, "trails"):
             stamp = message.header.stamp
             self._found[_ns(stamp)] = stamp, message_to_trails(message)
