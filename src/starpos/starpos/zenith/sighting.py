@@ -255,12 +255,9 @@ class StarPlaces:
     def applied(self, sightings: Sequence[ZenithSighting]) -> list[ZenithSighting]:
         """The sightings with the attitudes that the corrected places give."""
         return [
-            s.turned(rotation.from_vector(-self._turn(k, s)))
-            for k, s in zip(self.rows, sightings, strict=True)
+            s.turned(rotation.from_vector(-np.einsum("inj,nj->i", s.by_star, self.correction[rows])))
+            for rows, s in zip(self.rows, sightings, strict=True)
         ]
-
-    def _turn(self, rows: np.ndarray, s: ZenithSighting) -> np.ndarray:
-        return np.einsum("inj,nj->i", s.by_star, self.correction[rows])
 
     def columns(self, by_camera: np.ndarray, sightings: Sequence[ZenithSighting]) -> np.ndarray:
         """Errors of 1 sigma (N, 2, 3 S) of the readings, by what remains unknown of the places.
