@@ -171,7 +171,7 @@ def part_of(field: WideField, sky: Sky, found: Identification) -> tuple[Part, Id
         catalogue=catalogue,
         blend_px=found.blend_px[inside],
         attitude=pose.attitude,
-        mean_square_px2=_mean_square(residual),
+        mean_square_px2=float(np.square(residual).mean()),
         expected=found.expected[(from_middle < stars.half - INSIDE_PX).all(1)],
     )
 
@@ -247,7 +247,7 @@ class LensPose:
             attitude=self.attitude,
             focal_scale=self.camera.fx / field.camera.fx,
             residual_px=_rms_px(residual, np.hypot(sigma, FLOOR_PX)),
-            mean_square_px2=_mean_square(residual),
+            mean_square_px2=float(np.square(residual).mean()),
             log_odds=found.log_odds,
             expected=there.index[_within(self.project(there.directions), field.camera, -INSIDE_PX)],
             mirrored=found.mirrored,
@@ -358,11 +358,6 @@ def _rms_px(residual: np.ndarray, sigma_px: np.ndarray) -> float:
     """Root mean square of residuals (M, 2) along one axis, with the weights of the fit."""
     weight = 1 / np.square(sigma_px)
     return float(np.sqrt(np.square(residual).sum(1) @ weight / (2 * weight.sum())))
-
-
-def _mean_square(residual: np.ndarray) -> float:
-    """Mean square (px2) of residuals (M, 2) along one axis, all alike."""
-    return float(np.square(residual).mean())
 
 
 def _within(pixel: np.ndarray, camera: Camera, margin_px: float) -> np.ndarray:

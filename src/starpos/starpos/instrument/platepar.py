@@ -180,7 +180,7 @@ class SkyPixels:
     height_m: float
 
 
-def platepar_of(camera: Camera, seen: SkyPixels, station: str = "XX0001") -> tuple[dict[str, Any], float]:
+def platepar_of(camera: Camera, seen: SkyPixels) -> tuple[dict[str, Any], float]:
     """The content of a platepar, and by how many px at most RMS then sees a direction elsewhere than the camera.
 
     Its photometry is not calibrated: RMS's defaults.  InstrumentError for a camera that looks at a celestial pole.
@@ -197,7 +197,7 @@ def platepar_of(camera: Camera, seen: SkyPixels, station: str = "XX0001") -> tup
     pointing = _reference(seen_at, jd, *site)
     plate = _lens_terms(camera) | {
         "version": 2,
-        "station_code": station,
+        "station_code": "XX0001",
         "lat": float(np.degrees(seen.latitude)),
         "lon": float(np.degrees(seen.longitude)),
         "elev": float(seen.height_m),
