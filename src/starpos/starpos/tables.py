@@ -10,6 +10,7 @@ import warnings
 from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,13 @@ import numpy as np
 from starpos.errors import StarposError, TimeError, one_line
 from starpos.files import open_regular
 from starpos.units import unix_of
+
+
+def packaged(package: str, name: str) -> list[dict[str, str]]:
+    """Rows of a CSV in the folder `data` of a package; lines that begin with # are remarks."""
+    text = resources.files(package).joinpath("data", name).read_text("utf-8")
+    return list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
+
 
 # similarity from which an unknown column's name may be meant for a known one
 ALIKE_NAME = 0.7
