@@ -11,14 +11,14 @@ import xml.etree.ElementTree as ET
 import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from starpos.errors import one_line
 from starpos.frames.fits import decode_fits
 from starpos.frames.frame import MAX_PIXELS
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource
-from starpos_camera.sources.timing import check_exposed, clock_stddev_of, stamp_of
+from starpos_camera.sources.timing import clock_stddev_of, dated_by_driver
 
 # A server that has gone is noticed after two of these.
 BEAT_S = 0.5
@@ -447,18 +447,13 @@ class Indi(DeviceSource[IndiDevice]):
         set_up(device, exposure_s, settings.gain, self._values["indi.binning"])
         commanded_s = self._now()
         blob = expose(device, exposure_s, self._values["indi.readout"])
-        return self._frame(blob, exposure_s, commanded_s, self._now())
-
-    def _frame(self, blob: Blob, wanted_s: float, commanded_s: float, ready_s: float) -> CapturedFrame:
+        ready_s = self._now()
         frame, header = decode_fits(_unpacked(blob), "its frame")
         if frame.untimed:
             raise CaptureError(f"the header of its frame cannot be used: {frame.untimed}.")
-        exposure_s = frame.exposure_s or wanted_s
-        check_exposed(exposure_s, wanted_s, commanded_s, ready_s)
-        told = str(header.get("DATE-OBS", ""))
-        clock_s = clock_stddev_of("indi", self._host, self._values)
-        stamp = stamp_of(told, clock_s, exposure_s, commanded_s, ready_s, self._values)
-        return stamp.captured(replace(frame, exposure_s=exposure_s), self.hardware_id)
+        told, clock_s = str(header.get("DATE-OBS", "")), clock_stddev_of("indi", self._host, self._values)
+        exposures_s, between_s = (frame.exposure_s or exposure_s, exposure_s), (commanded_s, ready_s)
+        return dated_by_driver(frame, told, clock_s, exposures_s, between_s, self._values)
 
 
 def _unpacked(blob: Blob) -> bytes:
