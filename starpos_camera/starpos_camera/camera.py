@@ -13,7 +13,6 @@ import rclpy.parameter
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from rclpy.timer import Timer
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
@@ -109,8 +108,9 @@ class CameraNode(Node):
         self._clock_report = ClockReport(self, self._stamped_by_system)
         tasks: dict[str, Callable[[], Diagnosis]] = {"Capture": self._report, "Clock": self._clock_report}
         self._diagnostics = Diagnostics(self, tasks, self._source.hardware_id)
-        self._timer: Timer | None = None
-        self._start_timer()
+        # Simulated time sets the pace of a replay. The system's clock may be stepped, and a timer on it would wait.
+        clock = self.get_clock() if time_is_simulated(self) else Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self.create_timer(self._values["cadence"], self._tick, clock=clock)
         self._worker.start()
         if lack := self._source.lacking():
             self._say(Level.WARN, lack)
@@ -131,17 +131,10 @@ class CameraNode(Node):
     def _stamped_by_system(self) -> bool:
         return self._last is None or self._last.stamp_source in OF_SYSTEM_CLOCK
 
-    def _start_timer(self) -> None:
-        if self._timer is not None:
-            self.destroy_timer(self._timer)
-        # Simulated time sets the pace of a replay. The system's clock may be stepped, and a timer on it would wait.
-        simulated = time_is_simulated(self)
-        clock = self.get_clock() if simulated else Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(self._values["cadence"], self._tick, clock=clock)
-
     def _apply(self, names: frozenset[str]) -> None:
         if "cadence" in names:
-            self._start_timer()
+            self._timer.timer_period_ns = round(1e9 * self._values["cadence"])
+            self._timer.reset()
         self._source.update(self._values)
 
     def _tick(self) -> None:
@@ -190,11 +183,9 @@ class CameraNode(Node):
         return PreparedFrame(exposure, capture, image, time.monotonic() - begin)
 
     def _capture(self, settings: CaptureSettings) -> CapturedFrame:
-        if self._shutter is None:
-            return in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
         since_s = self._now_s()
         exposure = in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
-        return self._shutter.date_frame(exposure, since_s, self._now_s())
+        return self._shutter.date_frame(exposure, since_s, self._now_s()) if self._shutter else exposure
 
     def _on_wake(self) -> None:
         for result in self._worker.fetch():

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
@@ -242,7 +241,6 @@ class DetectorNode(Node):
         self._wake = self.create_guard_condition(self._on_wake)
         self._worker = Worker(self._detect, self._wake.trigger, "detection")
         self._diagnostics = Diagnostics(self, {"Stars": self._report})
-        _warm_up()
         self._worker.start()
 
     def listen(self) -> None:
@@ -459,15 +457,3 @@ class DetectorNode(Node):
                 "seconds": last.seconds,
             }
         return Diagnosis(level, sentence, values)
-
-
-def _warm_up() -> None:
-    """Run everything once on a small frame with a few stars, so that the first real frame is not slow."""
-    y, x = np.mgrid[:128, :128]
-    light = np.random.default_rng(0).normal(500.0, 10.0, x.shape)
-    for cx, cy in ((30.2, 40.7), (80.5, 30.1), (60.9, 95.4), (100.3, 101.8)):
-        light += 3000.0 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 2.0)
-    detection = detect(
-        Frame(light.astype(np.uint16), pattern="", mid_unix_s=0.0, exposure_s=1.0, source="warm-up")
-    )
-    stars_to_message(detection.stars, "")

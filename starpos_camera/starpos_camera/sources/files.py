@@ -188,8 +188,6 @@ class Files(FrameSource):
             return (
                 "files.watch looks into one folder: the pattern of files.path must be in its last part only."
             )
-        if watch and (lack := _no_home(path)):
-            return lack
         if values["files.exif"]:
             return missing("exifread", "exifread")
         if not math.isnan(values["files.exif_utc_offset"]):
@@ -221,8 +219,7 @@ class Files(FrameSource):
                 )
             if next(find_files(self._path), None) is None:
                 return f"{self._path}: there are no frames here; check files.path."
-        except (OSError, RuntimeError) as error:
-            # There is no permission, or no home of such a user.
+        except OSError as error:
             return f"{self._path}: it cannot be listed ({error}); check files.path."
         return None
 
@@ -301,17 +298,9 @@ def camera_clock(values: Mapping) -> CameraClock | None:
     return CameraClock(None if math.isnan(offset_h) else offset_h, values["files.exif_clock_stddev"])
 
 
-def _no_home(path: str) -> str | None:
-    try:
-        split(path)
-    except RuntimeError as error:
-        return f"files.path {path}: {error}; check it."
-    return None
-
-
 def split(path: str) -> tuple[Path, str]:
     """Split a path into the folder to watch and the pattern of names, '' for all frames."""
-    place = Path(path).expanduser()
+    place = Path(os.path.expanduser(path))
     return (place.parent, place.name) if glob.has_magic(place.name) else (place, "")
 
 
@@ -324,7 +313,7 @@ def fits(name: str, pattern: str) -> bool:
 
 def find_files(path: str) -> Iterator[Path]:
     """Find the frames in a folder, or all files that a pattern matches, in no order; none if there is no such place."""
-    place = Path(path).expanduser()
+    place = Path(os.path.expanduser(path))
     if place.is_dir():
         found = (file for file in place.iterdir() if fits(file.name, ""))
     else:

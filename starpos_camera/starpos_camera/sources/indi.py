@@ -160,21 +160,17 @@ class IndiDevice:
         self._pending += len(data)
         self._parser.feed(data)
         try:
-            self._take_all()
+            for event, element in self._parser.read_events():
+                self._depth += 1 if event == "start" else -1
+                # An element has come whole.
+                if self._depth == 0:
+                    self._take(element)
+                    self._root.clear()
+                    self._pending = 0
         except ET.ParseError as error:
             raise CaptureError(f"the INDI server sends what is no XML ({one_line(error)}).") from None
         if self._pending > ELEMENT_MAX:
             raise CaptureError("the INDI server sends more than any frame has.")
-
-    def _take_all(self) -> None:
-        """Take the elements that have come whole; ParseError for what is no XML."""
-        events: Any = self._parser.read_events()
-        for event, element in events:
-            self._depth += 1 if event == "start" else -1
-            if self._depth == 0:
-                self._take(element)
-                self._root.clear()
-                self._pending = 0
 
     def _take(self, element: ET.Element) -> None:
         """Note what an element of the server says."""
@@ -288,24 +284,15 @@ def set_up(device: IndiDevice, exposure_s: float, gain: float | None, binning: i
         if width and height:
             _set_numbers(device, "CCD_FRAME", X=0.0, Y=0.0, WIDTH=width, HEIGHT=height)
     if gain is not None:
-        vector, member = _gain_of(device)
+        found = [(v, m) for v, m in GAINS if m in device.vector(v).members]
+        if not found:
+            raise CaptureError("it has no gain to be set: leave `gain` unset.")
+        vector, member = found[0]
         _check_limits(device, vector, member, gain, "`gain`")
         if device.vector(vector).number(member) != gain:
             # The driver may round the gain to one that the camera has.
             _set(device, vector, **{member: repr(float(gain))})
     _check_limits(device, "CCD_EXPOSURE", "CCD_EXPOSURE_VALUE", exposure_s, "`exposure` (s)")
-
-
-def _gain_of(device: IndiDevice) -> tuple[str, str]:
-    """The vector and member that set the gain; CaptureError if none comes."""
-
-    def there() -> list[tuple[str, str]]:
-        return [(v, m) for v, m in GAINS if m in device.vector(v).members]
-
-    # A driver defines its properties one after the other, and nothing says which is the last.
-    if not device.until(there, ANSWER_S):
-        raise CaptureError("it has no gain to be set: leave `gain` unset.")
-    return there()[0]
 
 
 def expose(device: IndiDevice, exposure_s: float, readout_s: float) -> ET.Element:
