@@ -28,7 +28,7 @@ class Reader:
 
     def _wake(self):
         with self._event:
-            self.samples += self.link.fetch()
+            self.samples += self.link.arrivals()
             self._event.notify_all()
 
     def wait(self, condition) -> Health:

@@ -152,7 +152,7 @@ def test_the_drivers_memory_does_not_grow():
 
 
 def test_the_ascii_decoders_memory_does_not_grow():
-    decoder = LineDecoder(VALUES["ascii.pattern"], "deg")
+    decoder = LineDecoder(VALUES)
     rng = random.Random(5)
 
     def feed(k):

@@ -26,7 +26,7 @@ def each(samples: int) -> Iterator[tuple[str, float]]:
     values = defaults_of("inclinometer")
     yield "serial, as it is", serial(samples, values)
     yield "serial, compensated", serial(samples, values | COMPENSATED)
-    yield "ascii, lines alone", ascii_lines(samples, values["ascii.pattern"])
+    yield "ascii, lines alone", ascii_lines(samples, values)
 
 
 def rows(options) -> Iterator[Row]:
@@ -56,9 +56,9 @@ def serial(samples: int, values) -> float:
     return 1e6 * took_s / samples
 
 
-def ascii_lines(samples: int, pattern: str) -> float:
+def ascii_lines(samples: int, values: dict) -> float:
     """Measure the CPU time per line, from bytes to a believed sample, us."""
-    decoder = LineDecoder(pattern, "deg")
+    decoder = LineDecoder(values)
     lines = [b"%.3f,%.3f\r\n" % (3 + k % 7 * 1e-3, -11 - k % 5 * 1e-3) for k in range(samples)]
     began_s = time.process_time()
     believed = sum(len(decoder.decode(line, Moment(k / RATE_HZ, 0))) for k, line in enumerate(lines))

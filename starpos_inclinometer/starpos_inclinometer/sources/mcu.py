@@ -30,13 +30,11 @@ from starpos_inclinometer.sources.mcu_protocol import (
     mcu_follows,
 )
 from starpos_inclinometer.sources.serial_link import SerialLink, port_refusal
-from starpos_inclinometer.sources.source import Arrival, Counts, LinkSource, Surroundings
+from starpos_inclinometer.sources.source import Arrival, Counts, Surroundings
 from starpos_inclinometer.sources.tilts import (
     BoardSensor,
     Sca100t,
-    Sca100tCalibration,
     Scl3300,
-    noise_floor_rad,
 )
 from starpos_interfaces import msg
 
@@ -149,19 +147,6 @@ NEAR_CODES = {SensorKind.SCA100T: 11_000, SensorKind.SCL3300: 2_330}
 SMALLEST_DETERMINANT = 0.5
 
 
-def calibration(values: Mapping[str, Any]) -> Sca100tCalibration:
-    """Make the calibration of the sensor from the parameters."""
-    return Sca100tCalibration(
-        offset_volts=values["offset_volts"],
-        sensitivity_volts_per_g=values["sensitivity"],
-        divider=values["divider"],
-        reference_volts=values["reference_volts"],
-        temperature_reference_c=values["temperature.reference"],
-        offset_per_c=(values["temperature.offset_x"], values["temperature.offset_y"]),
-        sensitivity_per_c=(values["temperature.sensitivity_x"], values["temperature.sensitivity_y"]),
-    )
-
-
 class McuDecoder:
     """Turns the MCU's bytes into the samples that are believed, and asks the MCU for the wanted rate."""
 
@@ -238,12 +223,12 @@ class McuDecoder:
         return b""
 
     def _admit(self, arrival: Arrival) -> list[Arrival]:
-        rejected = self._gate.rejected
+        doubts = self._gate.rejected + self._continuity.restarts
         believed = [
             Arrival(self._continuity.follow(a.sample), a.moment, a.identity)
             for a in self._gate.admit(arrival)
         ]
-        if self._gate.rejected != rejected or any(a.sample.restarted for a in believed):
+        if self._gate.rejected + self._continuity.restarts != doubts:
             # After a reset the MCU runs at its default rate, perhaps with another firmware; samples that do not fit may
             # come from an unseen reset.
             self._ask = True
@@ -257,13 +242,12 @@ class McuTilts:
     """Converts believed samples to readings."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        self._sca100t = Sca100t()
         self._sensors: dict[int, BoardSensor] = {
-            SensorKind.SCA100T: self._sca100t,
-            SensorKind.SCL3300: Scl3300(),
+            SensorKind.SCA100T: Sca100t(values),
+            SensorKind.SCL3300: Scl3300(values),
         }
         # The sensor of the unit that was last heard.
-        self.sensor: BoardSensor = self._sca100t
+        self.sensor = self._sensors[SensorKind.SCA100T]
         self.arrivals = ArrivalFilter()
         self._line_s = mcu_protocol.SAMPLE_LINE * BITS_PER_BYTE / values["baud"]
         self._delay_ms = 0
@@ -274,10 +258,8 @@ class McuTilts:
         self.configure(values)
 
     def configure(self, values: Mapping[str, Any]) -> None:
-        self._sca100t.calibration = calibration(values)
         for sensor in self._sensors.values():
-            sensor.cross_axis = tuple(values["cross_axis"])
-            sensor.noise_floor_rad = noise_floor_rad(values)
+            sensor.configure(values)
         self._latency_s = values["latency"]
 
     def read(self, arrivals: list[Arrival]) -> list[Reading]:
@@ -291,8 +273,7 @@ class McuTilts:
             if isinstance(arrival.sample, Pulse):
                 self._date_pulse(arrival)
             elif arrival.identity is None:
-                sample = arrival.sample
-                self._gap |= bool(sample.lost) or sample.restarted or sample.resumed
+                self._gap |= arrival.sample.lost > 0 or arrival.sample.broken
             else:
                 readings.append(self._reading(arrival))
         return readings
@@ -323,8 +304,8 @@ class McuTilts:
     def _reading(self, arrival: Arrival) -> Reading:
         sample, moment = arrival.sample, arrival.moment
         self._follow(arrival.identity)
-        sample, self._gap = replace(sample, resumed=sample.resumed or self._gap), False
-        if sample.restarted or sample.resumed:
+        sample, self._gap = replace(sample, broken=sample.broken or self._gap), False
+        if sample.broken:
             self.arrivals.restart()
             self.pulses.restart()
         known_s = self.arrivals.delay(sample.milliseconds, moment.monotonic_s)
@@ -334,13 +315,11 @@ class McuTilts:
         return reading if known_s is not None else replace(reading, flags=reading.flags | TIME_UNKNOWN)
 
 
-class McuSource(LinkSource):
+class McuSource(SerialLink[McuDecoder]):
     """The starpos microcontroller on a serial port; see `McuTilts`."""
 
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
-        self.name = values["port"]
-        self._decoder = McuDecoder(values["rate"])
-        self._link = SerialLink(values["port"], values["baud"], self._decoder, host.clock, host.wake)
+        super().__init__(values["port"], values["baud"], McuDecoder(values["rate"]), host.clock, host.wake)
         self._tilts = McuTilts(values)
 
     @staticmethod
@@ -358,7 +337,7 @@ class McuSource(LinkSource):
         self._decoder.wanted_rate_hz = values["rate"]
 
     def fetch(self) -> list[Reading]:
-        return self._tilts.read(self._link.fetch())
+        return self._tilts.read(self.arrivals())
 
     def fetch_pulses(self) -> list[msg.Pulse]:
         return self._tilts.pulses.fetch()
@@ -368,7 +347,7 @@ class McuSource(LinkSource):
             return ""
         return f"the microcontroller refused {self._decoder.wanted_rate_hz} Hz: set another `rate`."
 
-    def _values(self) -> Mapping[str, object]:
+    def _shown(self) -> Mapping[str, object]:
         identity, tilts = self._decoder.identity, self._tilts
         return {
             "clock rate error (ppm)": tilts.arrivals.rate_ppm,

@@ -7,7 +7,7 @@ import fcntl
 import os
 import termios
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import serial
 
@@ -66,7 +66,10 @@ class Decoder(Protocol):
         """Whether the last bytes answered a command, so that the next command need not wait."""
 
 
-class SerialLink(Link):
+D = TypeVar("D", bound=Decoder)
+
+
+class SerialLink(Link, Generic[D]):
     """Reads the samples that come through a serial port.
 
     port: use a stable path (/dev/serial/by-id/...); it is resolved at each opening, and opened exclusively.
@@ -77,11 +80,11 @@ class SerialLink(Link):
         self,
         port: str,
         baud: int,
-        decoder: Decoder,
+        decoder: D,
         clock: HostClock,
         wake: Callable[[], object] = lambda: None,
     ) -> None:
-        super().__init__(clock, wake, "serial link")
+        super().__init__(port, clock, wake)
         self._port = port
         self._baud = baud
         self._decoder = decoder
