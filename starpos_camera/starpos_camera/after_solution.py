@@ -60,7 +60,6 @@ class AfterSolution:
 
     @property
     def wanted(self) -> bool:
-        """Whether the result has subscribers."""
         return self.publisher.get_subscription_count() > 0
 
     def work(self, job: Any) -> Any:
@@ -109,7 +108,6 @@ class AfterSolution:
             self._begin(None, f"no solution within {PATIENCE_S:g} s")
 
     def _begin(self, solution: Solution | None, without: str = "") -> None:
-        """Work on the frame that waits."""
         self._patience.cancel()
         subject, self._waiting = self._waiting, None
         if subject is not None and self.wanted and (job := self.job(subject, solution, without)) is not None:

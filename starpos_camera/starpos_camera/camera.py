@@ -62,7 +62,6 @@ class CameraNode(Node):
     """Publishes sensor_msgs/Image, CameraInfo and starpos_interfaces/Capture; see README.md."""
 
     def __init__(self, **options: Any) -> None:
-        """Make the node; options: as for rclpy's Node (context, namespace, parameter_overrides ...)."""
         super().__init__("camera", **options)
         self._values = declare(
             self, parameters_of("camera"), apply=self._apply, check=lambda values, _: _complaint(values)

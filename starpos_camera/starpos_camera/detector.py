@@ -213,7 +213,6 @@ class DetectorNode(Node):
     """Publishes starpos_interfaces/StarArray on `stars`, and frames with marks on `~/image_annotated`; see README.md."""
 
     def __init__(self, **options: Any) -> None:
-        """Make the node; options: as for rclpy's Node (context, namespace, parameter_overrides ...)."""
         super().__init__("detector", **options)
         self._values = declare(self, parameters_of("detector"), apply=self._apply)
         self._settings = DetectionSettings.by_parameters(self._values)

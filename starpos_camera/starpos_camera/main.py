@@ -11,14 +11,11 @@ if TYPE_CHECKING:
 
 
 def camera() -> int:
-    """Run the node `camera`."""
     about = "The frames of a camera, until Ctrl-C."
     return run_executable("starpos_camera", "camera", about, "camera:CameraNode")
 
 
 def detector() -> int:
-    """Run the node `detector`."""
-
     def make_nodes() -> "Iterator[Node]":
         from starpos_camera.detector import DetectorNode
 

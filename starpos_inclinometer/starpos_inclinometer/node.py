@@ -37,7 +37,6 @@ class Reporter:
         self._counts = Counts()
 
     def count(self, flags: int) -> None:
-        """Count the flags of a sample."""
         self._samples += 1
         for name, bit in FLAGS.items():
             self._flags[name] += bool(flags & bit)

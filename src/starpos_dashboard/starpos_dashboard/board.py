@@ -228,7 +228,6 @@ class Board:
         self._site: tuple[float, float] | None = None
 
     def keep_track_of(self, fixes: int) -> None:
-        """Keep this number of fixes from now on."""
         self._track = deque(self._track, maxlen=fixes)
 
     @property

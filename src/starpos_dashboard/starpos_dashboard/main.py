@@ -11,7 +11,6 @@ if TYPE_CHECKING:
 
 
 def dashboard() -> int:
-    """Run the node."""
     about = (
         "The instrument in a browser, at http://127.0.0.1:8042 unless parameters say otherwise, until Ctrl-C."
     )

@@ -44,7 +44,6 @@ HEADERS = {
 
 
 def own_names() -> frozenset[str]:
-    """The names of this machine."""
     name = socket.gethostname().lower()
     return frozenset({"localhost", name, f"{name}.local"})
 
@@ -166,7 +165,6 @@ class DashboardServer:
 
     @property
     def pages(self) -> int:
-        """Number of open pages."""
         return len(self.open)
 
     @property

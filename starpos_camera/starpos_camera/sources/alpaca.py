@@ -248,7 +248,6 @@ class Alpaca(DeviceSource[AlpacaCamera]):
         return "" if has == gain else f"its gain is {has}, though {gain:g} was set."
 
     def _wait(self, camera: AlpacaCamera, exposure_s: float) -> None:
-        """Wait until the picture is there."""
         begin = time.monotonic()
         while not camera.get("imageready"):
             left_s = begin + exposure_s - time.monotonic()

@@ -228,7 +228,6 @@ class AravisCamera:
         return region.width, region.height
 
     def _set_format(self, wanted: str) -> str:
-        """Set the pixel format; return its encoding."""
         offered = self.camera.dup_available_pixel_formats_as_strings()
         if wanted and (wanted not in FORMATS or wanted not in offered):
             raise CaptureError(

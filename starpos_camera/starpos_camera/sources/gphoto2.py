@@ -148,7 +148,6 @@ class Gphoto2Camera:
         return found
 
     def fetch(self, path: str) -> bytes:
-        """Fetch the bytes of a file."""
         place = str(PurePosixPath(path).parent), PurePosixPath(path).name
         size = self._camera.file_get_info(*place).file.size
         if not 0 < size <= MAX_FILE_BYTES:

@@ -44,7 +44,6 @@ class Vector:
     asked: bool = False
 
     def number(self, member: str) -> float | None:
-        """Value of a member; None without one."""
         return _number(self.members.get(member))
 
 
@@ -173,7 +172,6 @@ class IndiDevice:
             raise CaptureError("the INDI server sends more than any frame has.")
 
     def _take(self, element: ET.Element) -> None:
-        """Note what an element of the server says."""
         kind, name = element.tag, element.get("name", "")
         device = element.get("device", "")
         if kind.startswith("def"):

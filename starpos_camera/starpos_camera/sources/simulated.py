@@ -76,7 +76,6 @@ def air_from(values: Mapping) -> Atmosphere:
 
 
 def scene_from(values: Mapping) -> "Scene":
-    """Make the scene of the node's parameters."""
     from starpos.simulation.scene import scene_of
 
     return scene_of(

@@ -239,8 +239,6 @@ def _follows(a: Arrival, b: Arrival) -> bool:
 
 
 class AsciiSource(SerialLink[LineDecoder]):
-    """Reads the lines of a digital tiltmeter."""
-
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
         super().__init__(values["port"], values["baud"], LineDecoder(values), host.clock, host.wake)
         self._filter, self._pace = ArrivalFilter(), PaceWatch()

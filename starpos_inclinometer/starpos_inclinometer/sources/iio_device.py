@@ -77,7 +77,6 @@ class IioDevice:
 
     @property
     def step_rad(self) -> float:
-        """Step of a tilt near the horizon."""
         step = max(abs(c.scale) for c in self.channels)
         return math.radians(step) if self.kind == INCLINATION else step * self._unit / STANDARD_GRAVITY
 

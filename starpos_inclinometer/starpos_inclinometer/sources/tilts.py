@@ -202,7 +202,6 @@ class BoardSensor(SensorTilts):
         self.configure(values)
 
     def configure(self, values: Mapping[str, Any]) -> None:
-        """Take over the node's parameters."""
         self.cross_axis = tuple(values["cross_axis"])
         self.noise_floor_rad = noise_floor_rad(values)
 
@@ -269,7 +268,6 @@ class Sca100t(BoardSensor):
         )
 
     def volts(self, code: int) -> float:
-        """Convert a code to the sensor's output voltage."""
         return self._reference_volts / 2 + (code - CODE_ZERO) * self._volts_per_code
 
     def offset_and_sensitivity(self, axis: int, celsius: float) -> tuple[float, float]:
