@@ -134,7 +134,6 @@ class CameraNode(Node):
         if "cadence" in names:
             self._timer.timer_period_ns = round(1e9 * self._values["cadence"])
             self._timer.reset()
-        self._source.update(self._values)
 
     def _tick(self) -> None:
         if self._ended:

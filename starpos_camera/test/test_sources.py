@@ -111,9 +111,10 @@ def test_simulated_stars_are_where_starpos_says(scene):
 
 
 def test_simulated_sky_follows_its_parameters(scene):
-    source = make(**SMALL)
+    given = values(**SMALL)
+    source = made(given, SETTINGS, lambda: NOW_S)
     before = source.capture(SETTINGS).frame
-    source.update(values(**SMALL, simulated__azimuth=130.0))
+    given["simulated.azimuth"] = 130.0
     after = source.capture(CaptureSettings(1.0, None, 5.0)).frame
     assert after.exposure_s == 1.0
     assert abs(before.pixels.astype(int) - after.pixels).max() > 1000

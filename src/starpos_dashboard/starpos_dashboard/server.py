@@ -270,7 +270,6 @@ class Reply(RequestHandler):
     def prepare(self) -> None:
         headers = self.request.headers
         if self.request.method not in ("GET", "HEAD"):
-            self.set_header("Allow", "GET, HEAD")
             raise HTTPError(405, reason="this page only shows: GET and HEAD")
         if not host_is_known(headers.get("Host", ""), self.server.names):
             raise HTTPError(

@@ -78,6 +78,9 @@ class AlpacaCamera:
         self._address, self._place = address, f"/api/v1/camera/{number}"
         self._calls = count(1)
 
+    def release(self) -> None:
+        """Nothing is kept open between two calls."""
+
     def get(self, member: str) -> Any:
         """Value of a member; MemberError if the camera has none."""
         return self._json("GET", member, {})["Value"]

@@ -323,9 +323,6 @@ class Aravis(DeviceSource[AravisCamera]):
     def _open(self) -> AravisCamera:
         return AravisCamera(self._values)
 
-    def _close(self, device: AravisCamera) -> None:
-        device.release()
-
     def _explain(self, error: Exception) -> str:
         # Aravis reports everything as GLib.Error, and a camera's strange answers cause others.
         if isinstance(error, StarposError):

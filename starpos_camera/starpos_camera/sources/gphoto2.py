@@ -244,9 +244,6 @@ class Gphoto2(DeviceSource[Gphoto2Camera]):
         which = filter(None, (values["gphoto2.model"], values["gphoto2.port"]))
         self.hardware_id = " ".join(("gphoto2", *which))
 
-    def _close(self, device: Gphoto2Camera) -> None:
-        device.release()
-
     def _explain(self, error: Exception) -> str | None:
         import gphoto2
 

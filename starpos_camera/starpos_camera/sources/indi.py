@@ -79,7 +79,7 @@ class IndiDevice:
         self._depth = self._pending = 0
         self._ask()
 
-    def close(self) -> None:
+    def release(self) -> None:
         """Leave the server once it has read all that was sent to it."""
         end = time.monotonic() + LINK_S
         with suppress(OSError):
@@ -381,15 +381,12 @@ class Indi(DeviceSource[IndiDevice]):
     def _open(self) -> IndiDevice:
         return IndiDevice(self._host, self._port, self._name, self._closing)
 
-    def _close(self, device: IndiDevice) -> None:
-        device.close()
-
     def _expose(self, device: IndiDevice, settings: CaptureSettings) -> CapturedFrame:
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
         # What has come since the last frame: perhaps the end of the connection.
         device.until(lambda: False, DRAIN_S)
         if device.lost:
-            device.close()
+            device.release()
             device = self._device = self._open()
         check_there(device)
         connect_camera(device)
