@@ -138,11 +138,11 @@ class DashboardNode(Node):
             self._server.show(self._board.as_json(unix_s, self._values["stale_after"]), self._board.track)
 
     def _follow_viewers(self) -> None:
-        """Subscribe to the frames only while somebody looks, because the detector draws them for subscribers."""
-        looking = self._server.looking
-        if looking and self._images is None:
+        """Subscribe to the frames only while a page is open, because the detector draws them for subscribers."""
+        pages = self._server.pages
+        if pages and self._images is None:
             self._images = self._subscribe_frames()
-        elif not looking and self._images is not None:
+        elif not pages and self._images is not None:
             self.destroy_subscription(self._images)
             self._images = self._image = None
             self._server.frame = None

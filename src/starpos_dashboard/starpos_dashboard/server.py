@@ -168,11 +168,6 @@ class DashboardServer:
         return len(self.open)
 
     @property
-    def looking(self) -> bool:
-        """Whether an open page shows the frame."""
-        return any(page.looks for page in tuple(self.open))
-
-    @property
     def alive(self) -> bool:
         return self._thread.is_alive()
 
@@ -334,8 +329,8 @@ class Events(Reply):
 
     def initialize(self) -> None:
         self.news = asyncio.Event()
-        # Whether the page shows the frame, and the number of the last fix that was sent to it.
-        self.looks, self._sent_fix = self.request.query == "frame", 0
+        # Number of the last fix that was sent.
+        self._sent_fix = 0
 
     def head(self) -> None:
         self.set_header("Content-Type", "text/event-stream")

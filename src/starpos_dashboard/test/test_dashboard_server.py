@@ -169,15 +169,6 @@ def test_a_viewer_gets_the_state_and_of_the_track_what_it_has_not(server):
     wait(server, lambda: server.pages == 0)
 
 
-def test_frames_are_wanted_only_while_a_page_shows_them(server):
-    with closing(Viewer(server)):
-        wait(server, lambda: server.pages == 1)
-        assert not server.looking
-        with closing(Viewer(server, "/events?frame")):
-            wait(server, lambda: server.looking)
-        wait(server, lambda: not server.looking)
-
-
 def test_the_newest_frame_is_served_and_gone_when_it_is_taken_away(server):
     server.frame = b"\xff\xd8jpeg"
     status, headers, body = ask(server, "/frame.jpg?7")
