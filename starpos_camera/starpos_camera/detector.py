@@ -46,13 +46,12 @@ RAW, COMPRESSED = "camera/image_raw", "camera/image_raw/compressed"
 IMAGE_DEPTH = 1
 # how often publishers are compared with the subscriptions
 PUBLISHERS_LOOK_S = 0.5
-# A driver that sends MJPEG may offer the raw topic, too, and never send on it.
-RAW_PATIENCE_S = 5.0
 
 
 class FrameTopics:
-    """Subscribes to the raw topic, and to the compressed one where no raw frame comes; each frame is taken once.
+    """Subscribes to the raw topic, and to the compressed one until a raw frame comes; each frame is taken once.
 
+    A driver that sends MJPEG may offer the raw topic, too, and never send on it.
     take: takes an Image or a CompressedImage.
     """
 
@@ -65,8 +64,6 @@ class FrameTopics:
         self._raw: MatchedSubscription | None = None
         self._compressed: MatchedSubscription | None = None
         self._both = self._raw_sends = False
-        # since when a raw publisher is there, monotonic
-        self._offered_s: float | None = None
         # stamp of the last frame of each topic
         self._stamps: dict[type, tuple[int, int]] = {}
 
@@ -108,14 +105,9 @@ class FrameTopics:
         """Adapt the subscriptions to what is published."""
         assert self._raw is not None
         self._raw.look()
-        now_s = time.monotonic()
-        if not self._raw.publishers:
-            self._raw_sends, self._offered_s = False, None
-        elif self._offered_s is None:
-            self._offered_s = now_s
-        silent_s = None if self._offered_s is None else now_s - self._offered_s
+        self._raw_sends &= bool(self._raw.publishers)
         offered = self._node.count_publishers(self.compressed_topic) > 0
-        wanted = self._both or (offered and not self._raw_sends and wants_compressed(silent_s))
+        wanted = self._both or (offered and not self._raw_sends)
         if wanted and self._compressed is None:
             topic = self.compressed_topic
             self._compressed = MatchedSubscription(
@@ -140,11 +132,6 @@ class FrameTopics:
         self._stamps[type(message)] = key_of(message.header)
         if self._stamps.get(other) != key_of(message.header):
             self._take(message, info)
-
-
-def wants_compressed(silent_s: float | None) -> bool:
-    """Whether compressed frames are wanted, by the time for which raw ones are offered and none has come, None: not."""
-    return silent_s is None or silent_s > RAW_PATIENCE_S
 
 
 # Time that an image waits for its Capture, which comes on another topic: if a busy machine lost it, the middleware
