@@ -101,7 +101,7 @@ def test_cross_axis_matrix_and_its_covariance():
         moved = measure(sample(x + jump * (k == 0), y + jump * (k == 1)), cross_axis=matrix)
         slopes.append([(moved.x - reading.x), (moved.y - reading.y)])
     raw = np.linalg.solve(np.array(matrix).reshape(2, 2), [gx, gy])
-    sigma_code = math.radians(0.0035) * np.sqrt(1 - raw**2) / (c.volts_per_code / 4.0)
+    sigma_code = math.radians(0.0035) * np.sqrt(1 - raw**2) / (sensor(c).volts_per_code / 4.0)
     jacobian = np.array(slopes).T / jump * sigma_code
     expected = jacobian @ jacobian.T
     assert np.array(reading.covariance).reshape(2, 2) == pytest.approx(expected, rel=0.01)
@@ -200,7 +200,9 @@ def test_a_temperature_never_known_widens_the_error_by_all_it_may_be():
         (sample(broken=True), GAP),
         (sample(status=SampleStatus.NO_ANSWER), STUCK),
         (sample(status=SampleStatus.MEANINGLESS), STUCK),
-        (sample(status=SampleStatus.OVERRUN | 0xC0), 0),
+        (sample(status=SampleStatus.OVERRUN), 0),
+        (sample(status=SampleStatus.SELF_TEST), STUCK),
+        (sample(status=SampleStatus.UPSIDE_DOWN), OUT_OF_RANGE),
     ],
 )
 def test_flags(what, flags):

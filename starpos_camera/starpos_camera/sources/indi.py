@@ -8,7 +8,6 @@ import socket
 import threading
 import time
 import xml.etree.ElementTree as ET
-import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -226,6 +225,9 @@ SWITCHES = (
     ("UPLOAD_MODE", "UPLOAD_CLIENT"),
     ("CCD_TRANSFER_FORMAT", "FORMAT_FITS"),
     ("CCD_FRAME_TYPE", "FRAME_LIGHT"),
+    # By its newer and its older name.
+    ("CCD_COMPRESSION", "INDI_DISABLED"),
+    ("CCD_COMPRESSION", "CCD_RAW"),
 )
 # Drivers have one or the other.
 GAINS = (("CCD_GAIN", "GAIN"), ("CCD_CONTROLS", "Gain"))
@@ -394,7 +396,7 @@ class Indi(DeviceSource[IndiDevice]):
         commanded_s = self._now()
         blob = expose(device, exposure_s, self._values["indi.readout"])
         ready_s = self._now()
-        frame, header = decode_fits(_unpacked(blob), "its frame")
+        frame, header = decode_fits(_fits_of(blob), "its frame")
         if frame.untimed:
             raise CaptureError(f"the header of its frame cannot be used: {frame.untimed}.")
         told, clock_s = str(header.get("DATE-OBS", "")), clock_stddev_of("indi", self._host, self._values)
@@ -402,26 +404,17 @@ class Indi(DeviceSource[IndiDevice]):
         return dated_by_driver(frame, told, clock_s, exposures_s, between_s, self._values)
 
 
-def _unpacked(blob: ET.Element) -> bytes:
-    """Unpack the FITS file of a BLOB, and empty it; CaptureError if it is of another format or incomplete."""
+def _fits_of(blob: ET.Element) -> bytes:
+    """Take the FITS file out of a BLOB, which is emptied; CaptureError if it is of another format or incomplete."""
     kind = blob.get("format", "")
     try:
-        # The stated size is that before compression.
         data, size = base64.b64decode(blob.text or ""), int(blob.get("size", ""))
     except (binascii.Error, ValueError) as error:
         raise CaptureError(f"its frame is no BLOB ({one_line(error)}).") from None
     blob.clear()
     if not 0 < size <= BLOB_MAX:
         raise CaptureError(f"its frame claims {size} bytes; a frame has at most {BLOB_MAX}.")
-    # astropy unpacks this format.
-    if kind == ".fits.fz":
-        return data
-    if kind == ".fits.z":
-        try:
-            data = zlib.decompressobj().decompress(data, size + 1)
-        except zlib.error as error:
-            raise CaptureError(f"its frame cannot be unpacked ({one_line(error)}).") from error
-    elif kind != ".fits":
+    if kind != ".fits":
         raise CaptureError(f"it sends {one_line(kind)!r}, not FITS: set its driver's transfer format.")
     if len(data) != size:
         raise CaptureError(f"its frame has {len(data)} of {size} bytes; it is left out.")

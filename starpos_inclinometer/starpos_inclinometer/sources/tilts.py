@@ -261,14 +261,14 @@ class Sca100t(BoardSensor):
         self._reference_volts, self._reference_c = values["reference_volts"], values["temperature.reference"]
         full_scale = ADC_RANGE_V * self._reference_volts / ADC_NOMINAL_REFERENCE_V
         # Change of the sensor's output voltage for one code.
-        self._volts_per_code = values["divider"] * full_scale / CODE_ZERO
+        self.volts_per_code = values["divider"] * full_scale / CODE_ZERO
         # With t = T - reference: offset + c1 t + c2 t^2 + c3 t^3 [V], sensitivity (1 + c1 t + c2 t^2 + c3 t^3).
         self._offset_per_c, self._sensitivity_per_c = (
             [values[f"temperature.{name}_{axis}"] for axis in "xy"] for name in ("offset", "sensitivity")
         )
 
     def volts(self, code: int) -> float:
-        return self._reference_volts / 2 + (code - CODE_ZERO) * self._volts_per_code
+        return self._reference_volts / 2 + (code - CODE_ZERO) * self.volts_per_code
 
     def offset_and_sensitivity(self, axis: int, celsius: float) -> tuple[float, float]:
         """Offset (V) and sensitivity (V/g) of an axis at a temperature."""
@@ -285,7 +285,7 @@ class Sca100t(BoardSensor):
         x, y = self._angles_at(sample, self.temperature.celsius(self._reference_c))
         # The step of the sine over its slope.
         sx, sy = (
-            self._volts_per_code / self._sensitivity_volts_per_g[axis] / max(math.cos(angle), 0.1)
+            self.volts_per_code / self._sensitivity_volts_per_g[axis] / max(math.cos(angle), 0.1)
             for axis, angle in enumerate((x, y))
         )
         return (x, y), (sx, sy)
