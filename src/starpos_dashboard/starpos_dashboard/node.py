@@ -67,13 +67,11 @@ class DashboardNode(Node):
     def __init__(self) -> None:
         super().__init__("dashboard")
         self._values = declare(self, parameters_of("dashboard"), apply=self._apply)
-        self._board = board.Board(
-            self._values["track"], names(self._values["lights"]), namespace=self.get_namespace()
-        )
+        self._board = board.Board(self._values, namespace=self.get_namespace())
         address = self._values["address"]
         self._server = server.DashboardServer(
             server.listen(address, self._values["port"]),
-            server.own_names() | {address.lower()} | {n.lower() for n in names(self._values["hosts"])},
+            server.own_names() | {address.lower()} | {n.lower() for n in board.names(self._values["hosts"])},
             self._values["clients"],
         )
         # The newest that is not shown yet.
@@ -114,10 +112,6 @@ class DashboardNode(Node):
     def _apply(self, changed: frozenset[str]) -> None:
         if "rate" in changed:
             self._timer.timer_period_ns = round(1e9 / self._values["rate"])
-        if "track" in changed:
-            self._board.keep_track_of(self._values["track"])
-        if "lights" in changed:
-            self._board.only_lights_of(names(self._values["lights"]))
         self._server.clients = self._values["clients"]
 
     def _on_image(self, message: Image) -> None:
@@ -178,8 +172,3 @@ class DashboardNode(Node):
 
     def close(self) -> None:
         self._server.stop()
-
-
-def names(text: str) -> frozenset[str]:
-    """Split a list separated by commas into its words."""
-    return frozenset(word.strip() for word in text.split(",") if word.strip())
