@@ -199,7 +199,11 @@ class DayExposure:
 class DetectorNode(Node):
     """Publishes starpos_interfaces/StarArray on `stars`, and frames with marks on `~/image_annotated`; see README.md."""
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, listens: bool = True, **options: Any) -> None:
+        """Make the node; options: as for rclpy's Node.
+
+        listens: take the frames of `camera/image_raw`; otherwise a camera in the same process calls `submit`.
+        """
         super().__init__("detector", **options)
         self._values = declare(self, parameters_of("detector"), apply=self._apply)
         self._settings = DetectionSettings.by_parameters(self._values)
@@ -228,9 +232,10 @@ class DetectorNode(Node):
         self._worker = Worker(self._detect, self._wake.trigger, "detection")
         self._diagnostics = Diagnostics(self, {"Stars": self._report})
         self._worker.start()
+        if listens:
+            self._listen()
 
-    def listen(self) -> None:
-        """Take the frames of `camera/image_raw`. A camera in the same process calls `submit` instead."""
+    def _listen(self) -> None:
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._look = self.create_timer(LOOK_S, self._go_on, clock=steady, autostart=False)
         captures = subscription(self, Capture, "camera/capture", self._on_capture, CAPTURES_KEPT)

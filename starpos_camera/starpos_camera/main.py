@@ -16,15 +16,8 @@ def camera() -> int:
 
 
 def detector() -> int:
-    def make_nodes() -> "Iterator[Node]":
-        from starpos_camera.detector import DetectorNode
-
-        node = DetectorNode()
-        node.listen()
-        yield node
-
     about = "The stars of the frames on camera/image_raw, until Ctrl-C."
-    return run_executable("starpos_camera", "detector", about, make_nodes)
+    return run_executable("starpos_camera", "detector", about, "detector:DetectorNode")
 
 
 def camera_detector() -> int:
@@ -34,7 +27,7 @@ def camera_detector() -> int:
         from starpos_camera.camera import CameraNode
         from starpos_camera.detector import DetectorNode
 
-        detector = DetectorNode()
+        detector = DetectorNode(listens=False)
         yield detector
         camera = CameraNode()
         camera.hand_to(detector)
