@@ -20,14 +20,20 @@ from contextlib import suppress
 from importlib import resources
 from typing import Any
 
-from tornado.http1connection import HTTP1Connection
-from tornado.httpserver import HTTPServer
-from tornado.iostream import IOStream, StreamClosedError
-from tornado.netutil import bind_sockets
-from tornado.web import Application, HTTPError, RequestHandler
-
 from starpos.errors import StarposError, one_line
 from starpos.report.coast import COAST_FILE
+
+try:
+    from tornado.http1connection import HTTP1Connection
+    from tornado.httpserver import HTTPServer
+    from tornado.iostream import IOStream, StreamClosedError
+    from tornado.netutil import bind_sockets
+    from tornado.web import Application, HTTPError, RequestHandler
+except ImportError:
+    raise StarposError(
+        "the dashboard needs tornado, which is not installed: sudo apt install python3-tornado, "
+        "or pip install tornado"
+    ) from None
 
 HOST_NAME = re.compile(r"\[[0-9a-fA-F:.%]+\]|[A-Za-z0-9._-]+")
 HEADERS = {

@@ -7,6 +7,7 @@ import socket
 import sys
 import urllib.request
 from contextlib import closing
+from importlib import import_module
 
 import pytest
 import said
@@ -79,11 +80,10 @@ def test_no_address_is_not_every_address(made, address):
 
 
 def test_without_tornado_it_says_how_to_install_it(monkeypatch):
-    from starpos_dashboard.main import make_nodes
-
-    monkeypatch.setitem(sys.modules, "tornado", None)
+    monkeypatch.setitem(sys.modules, "tornado.http1connection", None)
+    monkeypatch.delitem(sys.modules, "starpos_dashboard.server", raising=False)
     with pytest.raises(StarposError, match="sudo apt install python3-tornado"):
-        next(make_nodes())
+        import_module("starpos_dashboard.server")
 
 
 def test_an_address_others_reach_is_a_warning_and_loopback_is_none(start, listener):
