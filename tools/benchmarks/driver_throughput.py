@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from table import Cost, Row
 
 from starpos.parameters.table import defaults_of
-from starpos_inclinometer.clock import Moment
+from starpos_inclinometer.clock import HostClock, Moment
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.ascii_line import LineDecoder
-from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
+from starpos_inclinometer.sources.mcu import McuDecoder, McuSource
+from starpos_inclinometer.sources.source import Surroundings
 from starpos_testing.emulator import Mcu
 
 RATE_HZ = 50
@@ -45,7 +46,7 @@ def serial(samples: int, values) -> float:
     mcu = Mcu(lambda now: (0.1, -0.2), rate_hz=RATE_HZ, seed=1)
     identity = mcu.reset(0.0)
     lines = [mcu.sample() for _ in range(samples)]
-    decoder, tilts = McuDecoder(RATE_HZ), McuTilts(values)
+    decoder, tilts = McuDecoder(RATE_HZ), McuSource(Surroundings(None, HostClock(), lambda: None), values)
     decoder.decode(identity, Moment(0.0, 0))
     readings, began_s = 0, time.process_time()
     for k, line in enumerate(lines):

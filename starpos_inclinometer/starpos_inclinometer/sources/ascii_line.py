@@ -240,7 +240,7 @@ def _follows(a: Arrival, b: Arrival) -> bool:
 
 class AsciiSource(SerialLink[LineDecoder]):
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
-        super().__init__(values["port"], values["baud"], LineDecoder(values), host.clock, host.wake)
+        super().__init__(host, values, LineDecoder(values))
         self._filter, self._pace = ArrivalFilter(), PaceWatch()
         self._tilts, self._sequence = SensorTilts(), -1
         self.configure(values)

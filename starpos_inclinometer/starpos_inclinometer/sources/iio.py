@@ -33,7 +33,7 @@ class IioSource(Link):
 
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
         self._root, self._wanted = Path(values["iio.root"]), values["iio.device"].strip()
-        super().__init__(self._wanted or values["iio.root"], host.clock, host.wake)
+        super().__init__(host, self._wanted or values["iio.root"])
         self._sampling_hz = values["iio.sampling_frequency"]
         self._good = self._failed = 0
         self.angles, self.forces = SensorTilts(), ImuTilts(values)

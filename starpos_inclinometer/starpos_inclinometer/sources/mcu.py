@@ -238,29 +238,44 @@ class McuDecoder:
         return mcu_follows(a, b, 1000 / self.identity.rate_hz if self.identity else None)
 
 
-class McuTilts:
-    """Converts believed samples to readings."""
+class McuSource(SerialLink[McuDecoder]):
+    """The starpos microcontroller on a serial port."""
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
+    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
+        super().__init__(host, values, McuDecoder(values["rate"]))
         self._sensors: dict[int, BoardSensor] = {
             SensorKind.SCA100T: Sca100t(values),
             SensorKind.SCL3300: Scl3300(values),
         }
         # The sensor of the unit that was last heard.
         self.sensor = self._sensors[SensorKind.SCA100T]
-        self.arrivals = ArrivalFilter()
+        self.filter, self.pulses = ArrivalFilter(), PulseTimes()
         self._line_s = mcu_protocol.SAMPLE_LINE * BITS_PER_BYTE / values["baud"]
-        self._delay_ms = 0
+        self._rate_hz = self._delay_ms = 0
         # The samples that came before the identity were the first after a gap.
         self._gap = False
-        self.pulses = PulseTimes()
-        self._rate_hz = 0
         self.configure(values)
+
+    @staticmethod
+    def refusal(values: Mapping[str, Any]) -> str | None:
+        xx, xy, yx, yy = values["cross_axis"]
+        if abs(xx * yy - xy * yx) < SMALLEST_DETERMINANT:
+            return (
+                "parameter cross_axis must be two different axes (xx, xy, yx, yy), such as [1, 0, 0, 1]; "
+                f"{list(values['cross_axis'])} was given."
+            )
+        return port_refusal(values)
 
     def configure(self, values: Mapping[str, Any]) -> None:
         for sensor in self._sensors.values():
             sensor.configure(values)
-        self._latency_s = values["latency"]
+        self._latency_s, self._decoder.wanted_rate_hz = values["latency"], values["rate"]
+
+    def fetch(self) -> list[Reading]:
+        return self.read(self.arrivals())
+
+    def fetch_pulses(self) -> list[msg.Pulse]:
+        return self.pulses.fetch()
 
     def read(self, arrivals: list[Arrival]) -> list[Reading]:
         """Convert the arrivals that an `McuDecoder` believed, in order.
@@ -280,7 +295,7 @@ class McuTilts:
 
     def _date_pulse(self, arrival: Arrival) -> None:
         """Date an edge through the clocks' relation that the samples have shown."""
-        sent_s = self.arrivals.arrival_s(arrival.sample.milliseconds, arrival.moment.monotonic_s)
+        sent_s = self.filter.arrival_s(arrival.sample.milliseconds, arrival.moment.monotonic_s)
         if sent_s is not None:
             sent_s -= self._sample_to_arrival_s()
         self.pulses.date(arrival.sample, arrival.moment, sent_s)
@@ -299,48 +314,20 @@ class McuTilts:
         # From now on all lines come later, or earlier, by the difference.
         if identity.delay_ms != self._delay_ms:
             self._delay_ms = identity.delay_ms
-            self.arrivals.restart()
+            self.filter.restart()
 
     def _reading(self, arrival: Arrival) -> Reading:
         sample, moment = arrival.sample, arrival.moment
         self._follow(arrival.identity)
         sample, self._gap = replace(sample, broken=sample.broken or self._gap), False
         if sample.broken:
-            self.arrivals.restart()
+            self.filter.restart()
             self.pulses.restart()
-        known_s = self.arrivals.delay(sample.milliseconds, moment.monotonic_s)
+        known_s = self.filter.delay(sample.milliseconds, moment.monotonic_s)
         late_s = known_s or 0.0
         stamp_ns = moment.stamp_ns(late_s + self._sample_to_arrival_s())
         reading = self.sensor.measure(sample, moment.monotonic_s - late_s, stamp_ns)
         return reading if known_s is not None else replace(reading, flags=reading.flags | TIME_UNKNOWN)
-
-
-class McuSource(SerialLink[McuDecoder]):
-    """The starpos microcontroller on a serial port; see `McuTilts`."""
-
-    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
-        super().__init__(values["port"], values["baud"], McuDecoder(values["rate"]), host.clock, host.wake)
-        self._tilts = McuTilts(values)
-
-    @staticmethod
-    def refusal(values: Mapping[str, Any]) -> str | None:
-        xx, xy, yx, yy = values["cross_axis"]
-        if abs(xx * yy - xy * yx) < SMALLEST_DETERMINANT:
-            return (
-                "parameter cross_axis must be two different axes (xx, xy, yx, yy), such as [1, 0, 0, 1]; "
-                f"{list(values['cross_axis'])} was given."
-            )
-        return port_refusal(values)
-
-    def configure(self, values: Mapping[str, Any]) -> None:
-        self._tilts.configure(values)
-        self._decoder.wanted_rate_hz = values["rate"]
-
-    def fetch(self) -> list[Reading]:
-        return self._tilts.read(self.arrivals())
-
-    def fetch_pulses(self) -> list[msg.Pulse]:
-        return self._tilts.pulses.fetch()
 
     def _complaint(self) -> str:
         if not self._decoder.refused:
@@ -348,13 +335,13 @@ class McuSource(SerialLink[McuDecoder]):
         return f"the microcontroller refused {self._decoder.wanted_rate_hz} Hz: set another `rate`."
 
     def _shown(self) -> Mapping[str, object]:
-        identity, tilts = self._decoder.identity, self._tilts
+        identity = self._decoder.identity
         return {
-            "clock rate error (ppm)": tilts.arrivals.rate_ppm,
-            "noise x, y (arcsec)": noise_text(tilts.sensor.noise.sigma),
-            "sensor temperature (deg C)": tilts.sensor.temperature.celsius(math.nan),
-            "pulses, and without a time": f"{tilts.pulses.dated}, {tilts.pulses.undated}",
-            "receiver's second": tilts.pulses.second,
+            "clock rate error (ppm)": self.filter.rate_ppm,
+            "noise x, y (arcsec)": noise_text(self.sensor.noise.sigma),
+            "sensor temperature (deg C)": self.sensor.temperature.celsius(math.nan),
+            "pulses, and without a time": f"{self.pulses.dated}, {self.pulses.undated}",
+            "receiver's second": self.pulses.second,
             "firmware": f"{identity.firmware >> 8}.{identity.firmware & 255}" if identity else "unknown",
             "sensor": SensorKind(identity.kind).name if identity else "unknown",
             "unit": f"{identity.unit:08X}" if identity else "unknown",

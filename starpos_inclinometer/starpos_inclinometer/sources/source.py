@@ -142,12 +142,12 @@ class TiltSource:
 class Link(TiltSource):
     """A source whose device a thread reads until `stop`, and opens again when it comes back.
 
-    clock: read at least once a second.
-    wake: called from the thread when there is something to fetch or the phase changed; it must be quick.
+    host: its clock is read at least once a second; `wake` is called from the thread when there is something to fetch or
+    the phase changed, and must be quick.
     """
 
-    def __init__(self, name: str, clock: HostClock, wake: Callable[[], object]) -> None:
-        self.name, self._clock, self._wake = name, clock, wake
+    def __init__(self, host: Surroundings, name: str) -> None:
+        self.name, self._clock, self._wake = name, host.clock, host.wake
         self._queue: deque[Arrival] = deque(maxlen=QUEUE)
         self._recent: deque[float] = deque(maxlen=QUEUE)
         # Of all that both threads use.
