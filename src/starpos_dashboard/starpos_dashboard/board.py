@@ -277,14 +277,6 @@ class Board:
         if abs(latitude) <= 90 and abs(longitude) <= 360:
             self._site = latitude, longitude
 
-    def show_frame(self, number: int, stamp_s: float | None, trouble: str = "") -> None:
-        """Note the number of a picture, or why it is missing."""
-        self.show("frame", {"number": number, "stamp": stamp_s, "trouble": text(trouble)})
-
-    def hide_frame(self) -> None:
-        """Forget the frame, because no page shows it and it would get old."""
-        self._heard.pop("frame", None)
-
     def _sun(self, now_s: float) -> list[list[float]] | None:
         """The Sun's way at the newest place, of the stars or of GNSS, or at a known one; None without any."""
         places = [self._heard.get(name, (0.0, {}))[1] for name in ("last_fix", "gnss")]

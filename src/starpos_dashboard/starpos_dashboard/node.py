@@ -140,7 +140,7 @@ class DashboardNode(Node):
             self.destroy_subscription(self._images)
             self._images = self._image = None
             self._server.frame = None
-            self._board.hide_frame()
+            self._board.show("frame", None)
 
     def _subscribe_frames(self) -> Subscription:
         return subscription(self, Image, "detector/image_annotated", self._on_image, 1)
@@ -154,7 +154,8 @@ class DashboardNode(Node):
             self._server.frame = jpeg(image, self._values["image_side"])
         except FrameError as e:
             trouble, self._server.frame = str(e), None
-        self._board.show_frame(self._shown, stamp_to_unix(image.header.stamp), trouble)
+        stamp_s = stamp_to_unix(image.header.stamp)
+        self._board.show("frame", {"number": self._shown, "stamp": stamp_s, "trouble": board.text(trouble)})
 
     # diagnostics -----------------------------------------------------------------------------------------------------
 
