@@ -197,9 +197,12 @@ class Files(FrameSource):
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
         super().__init__(values, now)
         self.hardware_id = self._path = values["files.path"]
-        self._loop = values["files.loop"]
-        self._restamp = values["files.restamp"]
-        self._clock = camera_clock(values)
+        # Of the camera that wrote the files' EXIF; None: it is not believed.
+        self._clock: CameraClock | None = None
+        if values["files.exif"]:
+            offset_h = values["files.exif_utc_offset"]
+            known_h = None if math.isnan(offset_h) else offset_h
+            self._clock = CameraClock(known_h, values["files.exif_clock_stddev"])
         # The files that this round has left, last first; None before the first round.
         self._queue: list[Path] | None = None
         self._bad: set[Path] = set()
@@ -239,7 +242,7 @@ class Files(FrameSource):
         frame = read_frame(path, self._clock)
         if not isinstance(frame, Frame):
             raise FrameError(f"{path}: it is a list of stars, not a frame; give FITS, TIFF, PNG or raw.")
-        if self._restamp:
+        if self._values["files.restamp"]:
             # The exposure is taken to have just ended, so that the tilts of its time are there.
             middle_s = self._now() - (frame.exposure_s or 0.0) / 2
             frame = replace(frame, mid_unix_s=middle_s, stamp_stddev_s=0.0)
@@ -279,7 +282,7 @@ class Files(FrameSource):
         return exposure
 
     def _next_round(self) -> list[Path]:
-        if self._queue is not None and not self._loop:
+        if self._queue is not None and not self._values["files.loop"]:
             raise SourceEnded(f"all frames of {self._path} are played.")
         if lack := self.lacking():
             raise FrameError(lack)
@@ -288,14 +291,6 @@ class Files(FrameSource):
         if not good:
             raise FrameError(f"{self._path}: none of its {len(files)} files is a frame; give others.")
         return good[::-1]
-
-
-def camera_clock(values: Mapping) -> CameraClock | None:
-    """Make the clock of the camera that wrote the files' EXIF; None unless files.exif is set."""
-    if not values["files.exif"]:
-        return None
-    offset_h = values["files.exif_utc_offset"]
-    return CameraClock(None if math.isnan(offset_h) else offset_h, values["files.exif_clock_stddev"])
 
 
 def split(path: str) -> tuple[Path, str]:
