@@ -134,16 +134,12 @@ class InclinometerNode(Node):
             self._diagnostics.publish()
 
     def _message(self, reading: Reading) -> Tilt:
-        message = Tilt()
+        message = Tilt(covariance=list(reading.covariance))
         message.header.stamp = Time(nanoseconds=reading.stamp_ns).to_msg()
         message.header.frame_id = self._values["frame_id"]
-        message.x = reading.x
-        message.y = reading.y
-        message.covariance = list(reading.covariance)
-        message.temperature = reading.temperature_c
-        message.sequence = reading.sequence
-        message.flags = reading.flags
-        message.z, message.z_variance = reading.z, reading.z_variance
+        # A reading has the message's names.
+        for name in ("x", "y", "z", "z_variance", "temperature", "sequence", "flags"):
+            setattr(message, name, getattr(reading, name))
         return message
 
     def _log(self, health: Health) -> bool:

@@ -20,7 +20,7 @@ from starpos.frames.encodings import MOSAICS
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, decoded
-from starpos_camera.sources.timing import dated, middle_of_commanded, middle_of_started
+from starpos_camera.sources.timing import dated, dated_by_command, dated_by_start
 from starpos_interfaces.msg import Capture
 
 # Between a camera's time and the moment of the light, where the clocks are related.
@@ -47,10 +47,9 @@ def stamp_of_camera(
     """
     frame, half_s = replace(frame, exposure_s=exposure_s), exposure_s / 2
     if commanded_s is None:
-        middle = middle_of_started(received_s - exposure_s, 0.0, exposure_s, values)
-        otherwise = dated(frame, *middle, Capture.DRIVER)
+        otherwise = dated_by_start(frame, received_s - exposure_s, 0.0, values)
     else:
-        otherwise = dated(frame, *middle_of_commanded(commanded_s, exposure_s, values), Capture.COMMAND)
+        otherwise = dated_by_command(frame, commanded_s, values)
     if camera_s is None:
         return otherwise
     if relation is None:

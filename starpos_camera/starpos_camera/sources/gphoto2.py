@@ -13,8 +13,7 @@ from typing import Any
 
 from starpos.frames.reading import RAW, decode_frame
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, missing
-from starpos_camera.sources.timing import dated, middle_of_commanded
-from starpos_interfaces.msg import Capture
+from starpos_camera.sources.timing import dated_by_command
 
 # Largest difference of an exposure or a gain from one that the camera has, as a share.
 TOLERANCE = 0.05
@@ -276,10 +275,9 @@ class Gphoto2(DeviceSource[Gphoto2Camera]):
         exposure_s = set_s if frame.exposure_s is None else frame.exposure_s
         if abs(math.log(exposure_s / set_s)) > TOLERANCE:
             remark = f"it says that it exposed for {exposure_s:g} s, though its shutter stood at {set_s:g} s."
-        mid_s, stddev_s = middle_of_commanded(commanded_s, exposure_s, self._values)
-        stddev_s = math.hypot(stddev_s, named_off_s(exposure_s) / 2)
-        taken = dated(replace(frame, exposure_s=exposure_s), mid_s, stddev_s, Capture.COMMAND)
-        return replace(taken, remark=remark)
+        taken = dated_by_command(replace(frame, exposure_s=exposure_s), commanded_s, self._values)
+        stddev_s = math.hypot(taken.frame.stamp_stddev_s, named_off_s(exposure_s) / 2)
+        return replace(taken, frame=replace(taken.frame, stamp_stddev_s=stddev_s), remark=remark)
 
     def _delete(self, camera: Gphoto2Camera, files: list[str]) -> str:
         """Delete the files of this exposure in the camera; return a sentence if that failed, otherwise ''."""
