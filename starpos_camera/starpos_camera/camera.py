@@ -61,7 +61,11 @@ class PreparedFrame:
 class CameraNode(Node):
     """Publishes sensor_msgs/Image, CameraInfo and starpos_interfaces/Capture; see README.md."""
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, detector: "DetectorNode | None" = None, **options: Any) -> None:
+        """Make the node; options: as for rclpy's Node.
+
+        detector: gets each frame in this process too, without a copy, in the executor's thread.
+        """
         super().__init__("camera", **options)
         self._values = declare(
             self, parameters_of("camera"), apply=self._apply, check=lambda values, _: _complaint(values)
@@ -92,7 +96,7 @@ class CameraNode(Node):
         self._last_took_s = 0.0
         # Columns and rows of the frames.
         self._size: tuple[int, int] | None = None
-        self._detectors: list[DetectorNode] = []
+        self._detector = detector
         self._ended = False
         self._state = (Level.WARN, "no frame has been taken yet.")
         self._said_s = -math.inf
@@ -120,10 +124,6 @@ class CameraNode(Node):
         self._source.close()
         self._worker.stop()
 
-    def hand_to(self, detector: "DetectorNode") -> None:
-        """Give each frame to a detector in this process too, without a copy, in the executor's thread."""
-        self._detectors.append(detector)
-
     def _now_s(self) -> float:
         return self.get_clock().now().nanoseconds * 1e-9
 
@@ -143,14 +143,15 @@ class CameraNode(Node):
         elif self._source.waits_for_listener and not self._frames and not self._heard():
             # Missing parts are reported first, because a subscriber would not help.
             lack = self._source.lacking()
-            stars = " or of the stars" if self._detectors else ""
+            stars = " or of the stars" if self._detector else ""
             waiting = f"waiting for a subscriber of {self._images.topic_name}{stars}."
             self._say(Level.WARN if lack else Level.OK, lack or waiting)
         else:
             self._worker.offer(_settings(self._values))
 
     def _heard(self) -> bool:
-        return self._images.get_subscription_count() > 0 or any(d.wanted for d in self._detectors)
+        wanted = self._detector is not None and self._detector.wanted
+        return wanted or self._images.get_subscription_count() > 0
 
     def _prepare(self, settings: CaptureSettings) -> PreparedFrame:
         """Take a frame and make it ready to be published, in the worker's thread."""
@@ -214,8 +215,8 @@ class CameraNode(Node):
         self._infos.publish(info)
         if prepared.image is not None:
             self._images.publish(prepared.image)
-        for detector in self._detectors:
-            detector.submit(frame, capture.header)
+        if self._detector is not None:
+            self._detector.submit(frame, capture.header)
         self._frames += 1
         self._last, self._last_took_s = capture, prepared.seconds
         self._size = frame.width, frame.height

@@ -53,36 +53,25 @@ class FrameTopics:
 
     A driver that sends MJPEG may offer the raw topic, too, and never send on it.
     take: takes an Image or a CompressedImage.
+    both: hear both topics all the time, as in a replay, where which of them sends shows only message by message.
     """
 
-    def __init__(self, node: Node, take: Take) -> None:
-        self._node, self._take = node, take
+    def __init__(self, node: Node, take: Take, both: bool) -> None:
+        self._node, self._take, self._both = node, take, both
         # with the raw topic the compressed one moves, unless it is remapped itself
         self.compressed_topic = node.resolve_topic_name(COMPRESSED)
         if self.compressed_topic == node.resolve_topic_name(COMPRESSED, only_expand=True):
             self.compressed_topic = f"{node.resolve_topic_name(RAW)}/compressed"
-        self._raw: MatchedSubscription | None = None
-        self._compressed: MatchedSubscription | None = None
-        self._both = self._raw_sends = False
         # stamp of the last frame of each topic
         self._stamps: dict[type, tuple[int, int]] = {}
-
-    def listen(self, both: bool) -> None:
-        """Subscribe.
-
-        both: hear both topics from the start, as in a replay, where which of them sends shows only message by message.
-        """
-        self._both = both
-        self._raw = MatchedSubscription(self._node, Image, RAW, self._pass_raw, IMAGE_DEPTH)
+        self._raw_sends = False
+        self._compressed: MatchedSubscription | None = None
+        self._raw = MatchedSubscription(node, Image, RAW, self._pass_raw, IMAGE_DEPTH)
+        # Where frames are expected, for sentences.
+        self.where = f" on {self._raw.topic}"
         self._look()
-        self._timer = self._node.create_timer(
-            PUBLISHERS_LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
-
-    @property
-    def where(self) -> str:
-        """Where frames are expected, for sentences; '' where nothing is subscribed."""
-        return f" on {self._raw.topic}" if self._raw else ""
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(PUBLISHERS_LOOK_S, self._look, clock=steady)
 
     def unheard(self) -> str:
         """Sentence on publishers that cannot be heard, and why; '' without any."""
@@ -91,7 +80,7 @@ class FrameTopics:
 
     def missing(self) -> str:
         """The rest of a sentence on why no frame comes; '' where a publisher is heard."""
-        if self._raw is None or self._raw.publishers or self._compressed is not None:
+        if self._raw.publishers or self._compressed is not None:
             return ""
         elsewhere = self._raw.elsewhere()
         hint = (
@@ -103,7 +92,6 @@ class FrameTopics:
 
     def _look(self) -> None:
         """Adapt the subscriptions to what is published."""
-        assert self._raw is not None
         self._raw.look()
         self._raw_sends &= bool(self._raw.publishers)
         offered = self._node.count_publishers(self.compressed_topic) > 0
@@ -223,7 +211,8 @@ class DetectorNode(Node):
         self._last_frame_s: float | None = None
         self._interval_s: float | None = None
         self._publisher = publisher(self, StarArray, "stars", 10)
-        self._topics = FrameTopics(self, self._on_image)
+        # None: a camera in this process hands over its frames.
+        self._topics: FrameTopics | None = None
         self._captures_come: Callable[[], int] = lambda: 0
         self._annotator = Annotator(self)
         self._day = DayExposure(self) if self._values["day_exposure"] else None
@@ -240,7 +229,7 @@ class DetectorNode(Node):
         self._look = self.create_timer(LOOK_S, self._go_on, clock=steady, autostart=False)
         captures = subscription(self, Capture, "camera/capture", self._on_capture, CAPTURES_KEPT)
         self._captures_come = captures.get_publisher_count
-        self._topics.listen(both=time_is_simulated(self))
+        self._topics = FrameTopics(self, self._on_image, both=time_is_simulated(self))
 
     def close(self) -> None:
         self._worker.stop()
@@ -395,7 +384,7 @@ class DetectorNode(Node):
 
     def _unsaid(self) -> str:
         """Sentence on the parameters to state of the camera; '' if there is nothing."""
-        unsaid = self._exposures.missing_statement if self._topics.where and not self._captures_come() else ""
+        unsaid = self._exposures.missing_statement if self._topics and not self._captures_come() else ""
         if unsaid:
             self._troubles.wrong("stamps", unsaid)
         return unsaid
@@ -411,22 +400,23 @@ class DetectorNode(Node):
         if last and last.detection.left_out:
             level = Level.WARN
             sentence += f" {last.detection.left_out} fainter peaks are left out: too many for stars, check the exposure."
+        topics, where = self._topics, self._topics.where if self._topics else ""
         silence_s = time.monotonic() - self._last_frame_s if self._last_frame_s is not None else math.inf
         if self._last_frame_s is None:
             level, sentence = (
                 Level.WARN,
-                f"no frame has come yet{self._topics.where}{self._topics.missing()}.",
+                f"no frame has come yet{where}{topics.missing() if topics else ''}.",
             )
         elif complaint:
             level, sentence = Level.WARN, complaint
         elif silence_s > max(MIN_SILENCE_S, 3 * (self._interval_s or 0.0)):
             level = Level.WARN
-            sentence = f"no frame for {silence_s:.0f} s{self._topics.where}: is the camera running?"
+            sentence = f"no frame for {silence_s:.0f} s{where}: is the camera running?"
         elif dropped := self._pace.complaint:
             level, sentence = Level.WARN, f"{sentence} {dropped}."
         elif unsaid := self._unsaid():
             level, sentence = Level.WARN, f"{sentence} {unsaid}"
-        if unheard := self._topics.unheard():
+        if topics and (unheard := topics.unheard()):
             self._troubles.wrong("unheard", unheard)
             level, sentence = Level.WARN, f"{unheard} {sentence}"
         values: dict[str, object] = {

@@ -29,9 +29,7 @@ def camera_detector() -> int:
 
         detector = DetectorNode(listens=False)
         yield detector
-        camera = CameraNode()
-        camera.hand_to(detector)
-        yield camera
+        yield CameraNode(detector)
 
     about = "The frames of a camera and their stars, two nodes in one process, until Ctrl-C."
     return run_executable("starpos_camera", "camera_detector", about, make_nodes, ("camera", "detector"))
