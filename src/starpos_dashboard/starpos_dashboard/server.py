@@ -104,16 +104,12 @@ TYPES = {
 }
 
 
-class DashboardError(StarposError):
-    """The page cannot be served."""
-
-
 def listen(address: str, port: int) -> list[socket.socket]:
-    """Bind the sockets; DashboardError that says what to do if they cannot be bound."""
+    """Bind the sockets; StarposError that says what to do if they cannot be bound."""
     try:
         return bind_sockets(port, address)
     except UnicodeError:
-        raise DashboardError(
+        raise StarposError(
             f"{address[:80]!r} is no address: set the parameter address to one of this machine's"
         ) from None
     except OSError as e:
@@ -122,7 +118,7 @@ def listen(address: str, port: int) -> list[socket.socket]:
             13: "set port above 1023",
         }
         cure = cures.get(e.errno or 0, "set the parameter address to one of this machine's")
-        raise DashboardError(
+        raise StarposError(
             f"{address}:{port} cannot be listened on ({one_line(e.strerror)}): {cure}"
         ) from None
 

@@ -255,15 +255,16 @@ def test_junk_ends_its_own_connection_only(server, junk):
 # tornado leaves the socket that it could not bind to the garbage collector
 @pytest.mark.filterwarnings("ignore:Exception ignored in. <socket:pytest.PytestUnraisableExceptionWarning")
 def test_a_port_in_use_is_said_in_a_sentence(server):
-    from starpos_dashboard.server import DashboardError, listen
+    from starpos.errors import StarposError
+    from starpos_dashboard.server import listen
 
-    with pytest.raises(DashboardError, match=f"127.0.0.1:{server.port} .*another program has this port"):
+    with pytest.raises(StarposError, match=f"127.0.0.1:{server.port} .*another program has this port"):
         listen("127.0.0.1", server.port)
-    with pytest.raises(DashboardError, match="set the parameter address"):
+    with pytest.raises(StarposError, match="set the parameter address"):
         listen("192.0.2.1", 0)
-    with pytest.raises(DashboardError, match="set the parameter address"):
+    with pytest.raises(StarposError, match="set the parameter address"):
         listen("no.such.name.invalid", 0)
-    with pytest.raises(DashboardError, match="is no address: set the parameter address"):
+    with pytest.raises(StarposError, match="is no address: set the parameter address"):
         listen("x" * 5000, 0)
 
 
