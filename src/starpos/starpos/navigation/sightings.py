@@ -12,17 +12,16 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S, earth_orientation, earth_state, station_velocity
 from starpos.earth.place import Place
-from starpos.earth.refraction import Atmosphere, Refraction
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
 from starpos.fix.attitude import CAMERA, ENU, GCRS, ITRS, LINK, Attitude, CameraAttitude
 from starpos.fix.heading import zenith_moved
 from starpos.fix.sighting import Sighting
 from starpos.fix.solution import Solution
-from starpos.fix.star_fit import MatchedStars, StarFit, fit_seen, seen_problem, sound_matches
+from starpos.fix.star_fit import MatchedStars, fit_seen, sound_matches
 from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
-from starpos.frozen import at_once
 from starpos.identification import fisheye
 from starpos.instrument.camera import Camera
 from starpos.navigation.vessel import Vessel
@@ -31,7 +30,6 @@ from starpos.units import ARCSEC
 
 # of an attitude without refraction; 1 sigma
 ROUGH = 20 * ARCSEC
-STEP_REFRACTION = 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,69 +37,65 @@ class FrameUnderWay(Sighting, ABC):
     """A sighting whose attitude is computed again under each zenith that is tried."""
 
     def rough(self) -> Attitude:
-        """The attitude as it is without a place."""
-        return roughly(self.camera.rotation)
+        """The attitude as it is without a place, good to ROUGH."""
+        return Attitude(self.camera.rotation, np.eye(3) * ROUGH**2, of=CAMERA, into=ITRS)
 
     @abstractmethod
-    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
-        """The attitude under a zenith (3,) in ITRS; FixError where it has none."""
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> tuple[Attitude, np.ndarray]:
+        """The attitude under a zenith (3,) in ITRS, and how it turns if refraction is stronger by its own size.
+
+        The turn is a small rotation (3,) about ITRS's axes, rad.
+        """
 
 
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class IdentifiedFrame(FrameUnderWay):
-    """N identified stars of a frame; `camera` is without refraction, good to ROUGH rad.
-
-    xy (N, 2), covariance_px2 (N, 2, 2): px, on a frame of the camera `optics`.
-    itrs (N, 3): geocentric apparent directions in ITRS.
-    """
-
-    xy: np.ndarray
-    covariance_px2: np.ndarray
-    itrs: np.ndarray
-    optics: Camera
-
-    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
-        """The attitude under a zenith (3,) in ITRS, with the plate scale, by the stars; FixError if they disagree."""
-        seen = self._fitted(_seen(self, zenith, atmosphere.refraction()))
-        stronger = _seen(self, zenith, atmosphere.refraction(1 + STEP_REFRACTION))
-        fit = seen.fit
-        there = seen_problem(self.xy, self.optics, stronger).predict(fit.a4, fit.scale)
-        shift = (there - self.xy - fit.residual)[fit.kept] / STEP_REFRACTION
-        # the camera turns the other way than the sky in it
-        return _camera_of(seen, -seen.errors.rotated(shift))
-
-    def placeless(self) -> Attitude:
-        """Fit attitude and plate scale where no zenith is known: refraction and diurnal aberration stay in it."""
-        return _camera_of(self._fitted(self.itrs), np.zeros(3))
-
-    def _fitted(self, seen: np.ndarray) -> StarFit:
-        """The fit to the directions seen (N, 3); FixError if the stars disagree."""
-        try:
-            return fit_seen(self.xy, self.covariance_px2, self.optics, seen)
-        except FixError as error:
-            raise FixError(f"{self.source}: {error}: left out") from None
+# Refraction squeezes a frame more along the vertical than across. This turns the attitude across the axis if the middle
+# of the stars is off the axis (rad), and about it if stars spread farther one way than the other (share): 1 sigma.
+OFF_AXIS, SPREAD = 0.03, 0.25
+# sine of the lowest altitude that this is for
+LOWEST = 0.1
+CIRCLE = np.array([[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4])
 
 
-def _camera_of(seen: StarFit, by_refraction: np.ndarray) -> Attitude:
-    """The camera's attitude by a fit; by_refraction (3,): about C's axes."""
-    own = Attitude(
-        np.eye(3),
-        seen.errors.rotation_covariance(seen.errors.centroids),
-        of=CAMERA,
-        into=CAMERA,
-        by_refraction=by_refraction,
-    )
-    return own.then(seen.fit.a4.T, ITRS)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlacelessFrame(FrameUnderWay):
+    """An attitude by stars, which refraction and diurnal aberration have turned, as CameraAttitude has it."""
+
+    @classmethod
+    def of(cls, attitude: CameraAttitude) -> "PlacelessFrame":
+        """The frame of an attitude that has a time; TimeError outside the IERS tables."""
+        assert attitude.utc_unix_s is not None
+        turn = attitude.camera_to_gcrs
+        among_stars = Attitude(turn, turn @ attitude.covariance @ turn.T, of=CAMERA, into=GCRS)
+        return cls(
+            utc_unix_s=attitude.utc_unix_s,
+            stamp_stddev_s=attitude.stamp_stddev_s,
+            camera=among_stars.then(earth_state(attitude.utc_unix_s).gcrs_to_itrs, ITRS),
+        )
+
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> tuple[Attitude, np.ndarray]:
+        """The attitude under a zenith (3,) in ITRS, from where stars around the camera's axis would be seen there.
+
+        The attitude's covariance gives the distance of the frame's own stars from it.  The fitted plate scale has
+        absorbed the effect of refraction that is the same in all directions.  The covariance contains the rest, which
+        depends on the directions in which the stars lie.
+        """
+        given, covariance = self.camera.rotation, self.camera.covariance_about_own
+        across, about = np.diag(covariance)[:2].mean(), covariance[2, 2]
+        ring = np.column_stack([np.sqrt(across / about) * CIRCLE, np.ones(len(CIRCLE))])
+        true = rotation.normalised(ring) @ given.T
+        apparent = rotation.normalised(true + station_velocity(zenith))
+        level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
+        seen = atmosphere.refraction().bend(apparent @ level.T) @ level
+        camera = rotation.best_rotation(true, seen) @ given
+        raised = rotation.to_small_vector(rotation.best_rotation(apparent, seen))
+        height = max(float(seen.mean(0) @ zenith), LOWEST)
+        squeezed = float(np.linalg.norm(raised)) * np.sqrt(1 - min(height, 1.0) ** 2) / height
+        uneven = squeezed * np.array([OFF_AXIS, OFF_AXIS, SPREAD])
+        whole = covariance + np.diag(uneven**2)
+        return Attitude(camera, camera @ whole @ camera.T, of=CAMERA, into=ITRS), raised
 
 
-def roughly(camera_to_itrs: np.ndarray) -> Attitude:
-    """An attitude (3, 3) that is good to ROUGH."""
-    error = np.eye(3) * ROUGH**2
-    return Attitude(camera_to_itrs, error, of=CAMERA, into=ITRS, by_refraction=np.zeros(3))
-
-
-def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> IdentifiedFrame:
+def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> PlacelessFrame:
     """The frame under way of stars that are identified; a StarposError says why it cannot be used.
 
     answer: of these stars, by the solver's camera.
@@ -127,70 +121,28 @@ def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> Identifie
     places = catalogue.directions(found.catalogue[use], state.year, state.observer_au)
     matched = MatchedStars.of(stars, found, use, camera, catalogue, state.year, places)
     catalogue_px2 = np.square(matched.place_sigma * camera.fx)[:, None, None]
-    return IdentifiedFrame(
-        utc_unix_s=mid_unix_s,
-        stamp_stddev_s=stars.stamp_stddev_s,
-        source=stars.place,
-        xy=matched.xy,
-        covariance_px2=matched.covariance_px2 + np.eye(2) * catalogue_px2,
-        itrs=state.to_itrs(places),
-        optics=camera.scaled(found.focal_scale),
-        camera=roughly(state.gcrs_to_itrs @ found.attitude.T),
+    try:
+        attitude = placeless(
+            matched.xy,
+            matched.covariance_px2 + np.eye(2) * catalogue_px2,
+            camera.scaled(found.focal_scale),
+            state.to_itrs(places),
+        )
+    except FixError as error:
+        raise FixError(f"{stars.place}: {error}: left out") from None
+    return PlacelessFrame(
+        utc_unix_s=mid_unix_s, stamp_stddev_s=stars.stamp_stddev_s, source=stars.place, camera=attitude
     )
 
 
-def _seen(sighting: IdentifiedFrame, zenith: np.ndarray, refraction: Refraction) -> np.ndarray:
-    """Directions (N, 3) along ITRS's axes in which the stars are seen under a zenith."""
-    level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
-    apparent = rotation.normalised(sighting.itrs + station_velocity(zenith))
-    return refraction.bend(apparent @ level.T) @ level
+def placeless(xy: np.ndarray, covariance_px2: np.ndarray, optics: Camera, itrs: np.ndarray) -> Attitude:
+    """Fit attitude and plate scale where no zenith is known: refraction and diurnal aberration stay in it.
 
-
-# Refraction squeezes a frame more along the vertical than across. This turns the attitude across the axis if the middle
-# of the stars is off the axis (rad), and about it if stars spread farther one way than the other (share): 1 sigma.
-OFF_AXIS, SPREAD = 0.03, 0.25
-# sine of the lowest altitude that this is for
-LOWEST = 0.1
-CIRCLE = np.array([[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4])
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PlacelessFrame(FrameUnderWay):
-    """An attitude without refraction and diurnal aberration, as CameraAttitude has it."""
-
-    @classmethod
-    def of(cls, attitude: CameraAttitude) -> "PlacelessFrame":
-        """The frame of an attitude that has a time; TimeError outside the IERS tables."""
-        assert attitude.utc_unix_s is not None
-        turn = attitude.camera_to_gcrs
-        among_stars = Attitude(turn, turn @ attitude.covariance @ turn.T, of=CAMERA, into=GCRS)
-        return cls(
-            utc_unix_s=attitude.utc_unix_s,
-            stamp_stddev_s=attitude.stamp_stddev_s,
-            camera=among_stars.then(earth_state(attitude.utc_unix_s).gcrs_to_itrs, ITRS),
-        )
-
-    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
-        """The attitude under a zenith (3,) in ITRS, from where stars around the camera's axis would be seen there.
-
-        The attitude's covariance gives the distance of the frame's own stars from it.  The fitted plate scale has
-        absorbed the effect of refraction that is the same in all directions.  The covariance contains the rest, which
-        depends on the directions in which the stars lie.
-        """
-        given, covariance = self.camera.rotation, self.camera.covariance_about_own
-        across, about = np.diag(covariance)[:2].mean(), covariance[2, 2]
-        ring = np.column_stack([np.sqrt(across / about) * CIRCLE, np.ones(len(CIRCLE))])
-        true = rotation.normalised(ring) @ given.T
-        apparent = rotation.normalised(true + station_velocity(zenith))
-        level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
-        seen = atmosphere.refraction().bend(apparent @ level.T) @ level
-        camera = rotation.best_rotation(true, seen) @ given
-        raised = rotation.to_small_vector(rotation.best_rotation(apparent, seen))
-        height = max(float(seen.mean(0) @ zenith), LOWEST)
-        squeezed = float(np.linalg.norm(raised)) * np.sqrt(1 - min(height, 1.0) ** 2) / height
-        uneven = squeezed * np.array([OFF_AXIS, OFF_AXIS, SPREAD])
-        whole = covariance + np.diag(uneven**2)
-        return Attitude(camera, camera @ whole @ camera.T, of=CAMERA, into=ITRS, by_refraction=raised)
+    xy (N, 2), covariance_px2 (N, 2, 2): stars on a frame of a camera, px.  itrs (N, 3): geocentric apparent directions.
+    FixError if the stars disagree.
+    """
+    seen = fit_seen(xy, covariance_px2, optics, itrs)
+    return Attitude(np.eye(3), seen.own, of=CAMERA, into=CAMERA).then(seen.fit.a4.T, ITRS)
 
 
 # how far a direction that is said to be the Sun's may be from it, rad
@@ -221,9 +173,7 @@ class SunFrame(FrameUnderWay):
         return cls(
             utc_unix_s=seen.utc_unix_s,
             stamp_stddev_s=seen.stamp_stddev_s,
-            camera=Attitude(
-                turn, turn @ seen.covariance @ turn.T, of=CAMERA, into=ITRS, by_refraction=np.zeros(3)
-            ),
+            camera=Attitude(turn, turn @ seen.covariance @ turn.T, of=CAMERA, into=ITRS),
             ray=seen.ray,
             body=body,
             place=place,
@@ -232,7 +182,7 @@ class SunFrame(FrameUnderWay):
     def rough(self) -> Attitude:
         return self.camera
 
-    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> tuple[Attitude, np.ndarray]:
         """The attitude under a zenith (3,) in ITRS, turned anyhow about the Sun."""
         true = self.body.from_place(zenith)
         level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
@@ -242,7 +192,7 @@ class SunFrame(FrameUnderWay):
         layers = raised**2 - (math.dist(seen, true) * atmosphere.relative_sigma) ** 2
         across = rotation.normalised(np.cross(zenith, seen))
         covariance = turn @ self.camera.covariance_about_own @ turn.T + layers * np.outer(across, across)
-        return Attitude(turn, covariance, of=CAMERA, into=ITRS, by_refraction=np.cross(true, seen))
+        return Attitude(turn, covariance, of=CAMERA, into=ITRS), np.cross(true, seen)
 
     def heading_by(self, link: Attitude) -> Attitude:
         """The body's attitude at the known place: level by the plumb line, north by WGS 84.
@@ -269,13 +219,12 @@ def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitu
     The errors are of stars, air, time, place, deflection and mount.
     """
     a4, air = place.plumb_axes, vessel.atmosphere
-    seen = frame.under(a4[2], air)
-    seen = seen.then(a4, ENU)
-    assert seen.by_refraction is not None
+    against_earth, by_refraction = frame.under(a4[2], air)
+    seen = against_earth.then(a4, ENU)
     late_s = [frame.stamp_stddev_s, vessel.clock_stddev_s, earth_orientation(frame.utc_unix_s).ut1_sigma_s]
     moved = zenith_moved(place.plumb[0])
     columns = np.column_stack([
-        seen.by_refraction * air.relative_sigma,
+        a4 @ by_refraction * air.relative_sigma,
         a4[:, 2] * ROTATION_RAD_S * math.hypot(*late_s),
         moved @ place.zenith_root,
         moved * np.array([[place.plumb_stddev], [place.plumb_stddev], [place.ellipsoid_stddev]]),
