@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
-from string import digits as DIGITS
+from string import digits
 from types import ModuleType
 from typing import Any
 
@@ -266,9 +266,9 @@ def best_format(offered: list[str], present: str) -> str:
     """
     known = [name for name in offered if name in FORMATS]
     mosaics = [name for name in known if name.startswith("Bayer")]
-    patterns = {name.rstrip(DIGITS) for name in mosaics}
+    patterns = {name.rstrip(digits) for name in mosaics}
     if len(patterns) > 1:
-        known = [name for name in known if name.rstrip(DIGITS) == present.rstrip(DIGITS)]
+        known = [name for name in known if name.rstrip(digits) == present.rstrip(digits)]
     elif mosaics:
         known = mosaics
     if not known:
