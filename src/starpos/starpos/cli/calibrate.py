@@ -23,7 +23,7 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, PlaceError, StarposError
 from starpos.files import save
-from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn
+from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn, unnamed_inclinometer
 from starpos.fix.heading import confirms_hour
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
@@ -40,7 +40,7 @@ from starpos.night import horizon
 from starpos.night.extinction import light_of
 from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
-from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_inclinometer, of_left_out
+from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_left_out
 from starpos.night.together import axis_of, circles_of
 from starpos.night.watching import Answer, kept, night_poses, sky_mag
 from starpos.night.work import Solving
@@ -112,7 +112,7 @@ def run_site(
         )
     else:
         found = calibrate_at(solver, frames, tilts, site, options.turn_of(args), bar, known)
-        console.complain(*of_inclinometer(instrument))
+        console.complain(unnamed_inclinometer(instrument))
     for solution in found.solutions:
         if solution.fix is None:
             console.complain(f"left out: {solution.message}")
@@ -133,7 +133,7 @@ def run_elevations(
             console.complain(f"left out: {row}")
     site = _site(args)
     found = axis_of(solver, pointings, tilts, site=site)
-    console.complain(*of_left_out(found.left_out), *of_inclinometer(instrument))
+    console.complain(of_left_out(found.left_out), unnamed_inclinometer(instrument))
     scatter = np.sqrt(1 + found.scatter2)
     if scatter > SCATTERED and found.stddev_arcsec > WORTH_SAVING_ARCSEC:
         raise FixError(
@@ -278,7 +278,7 @@ def run(args: argparse.Namespace) -> int:
     except (CalibrationError, FixError, PlaceError) as e:
         console.complain(e)
         if not _known(frames):
-            console.complain(*Solving(replace(given, instrument=instrument)).fitting(frames[0][0]))
+            console.complain(Solving(replace(given, instrument=instrument)).fitting(frames[0][0]))
         return console.UNREADABLE if unreadable else NOTHING
     return console.UNREADABLE if unreadable else 0
 

@@ -11,12 +11,12 @@ import numpy as np
 from starpos.cli import console, inputs, options
 from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, InstrumentError, TiltError
+from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.solution import Solution
 from starpos.instrument.instrument import Instrument, with_frame_size
 from starpos.night.at_mark import ZenithSighted
 from starpos.night.bag import each_frame, is_bag
 from starpos.night.reading import First
-from starpos.night.remarks import of_inclinometer
 from starpos.night.work import OnFile
 from starpos.units import ARCSEC, utc_text
 from starpos.zenith.adjustment import DeflectionSession, FaceQuality, Reduced, reduced
@@ -202,7 +202,7 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
 def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
     """Adjust the session and print it; returns the exit status."""
     output = console.Output(args, COLUMNS, HEAD)
-    console.complain(*of_inclinometer(taken.instrument))
+    console.complain(unnamed_inclinometer(taken.instrument))
     rows = list(zip(taken.names, taken.answers, strict=True))
     for name, answer in rows:
         if not isinstance(answer, ZenithSighting):

@@ -303,13 +303,13 @@ def heading_text_of(found: AttitudeAtPlace | MeanAttitude) -> str:
     return f"heading {heading} (WGS 84: {on_ground}) deg, pitch {pitch}, roll {roll}"
 
 
-def mean_of(answers: Sequence[Solution]) -> tuple[MeanAttitude | None, tuple[str, ...]]:
-    """The mean attitude of the frames, or None with the reason; the reason is empty if no frame has an attitude."""
+def mean_of(answers: Sequence[Solution]) -> tuple[MeanAttitude | None, str]:
+    """The mean attitude of the frames, or None with the reason, which is empty if no frame has an attitude."""
     attitudes = [s.at_place for s in answers if s.at_place]
     try:
-        return (mean_attitude(attitudes) if attitudes else None), ()
+        return (mean_attitude(attitudes) if attitudes else None), ""
     except FixError as error:
-        return None, (str(error),)
+        return None, str(error)
 
 
 def _with_variance(covariance: np.ndarray | None, heading: float) -> np.ndarray:

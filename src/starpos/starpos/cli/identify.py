@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
             output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
     complaints.end()
     if lost is not None and not any_found:
-        console.complain(*solving.fitting(lost))
+        console.complain(solving.fitting(lost))
     return console.UNREADABLE if unreadable else 0 if any_found else 1
 
 

@@ -123,7 +123,7 @@ def identifying(
 def checked_tilts(path: str, instrument: Instrument) -> TiltFile:
     """The table of tilts, with a complaint where its steps are coarse; raises TiltError, also for radians."""
     file = TiltFile(path, instrument.inclinometer.noise_rad)
-    console.complain(*of_tilts(file.log, path, instrument.inclinometer))
+    console.complain(of_tilts(file.log, path, instrument.inclinometer))
     return file
 
 

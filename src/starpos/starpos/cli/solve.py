@@ -16,6 +16,7 @@ from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import InstrumentError, StarposError, TiltError
 from starpos.fix.blind import BlindSolver
+from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.solution import Solution, status_of
 from starpos.fix.solver import Solver
 from starpos.frames.reading import are_photographs
@@ -27,7 +28,7 @@ from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night import field
 from starpos.night.opening import work_of
 from starpos.night.reading import NO_CAMERA, About, First, Instruments
-from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, of_inclinometer
+from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near
 from starpos.night.solving import How, NightAnswers, answers_of
 from starpos.night.together import FrameAnswer, Gathered, TurnedNight, from_elevations, together, turned
 from starpos.night.work import OnFile, Solving
@@ -71,10 +72,11 @@ def tell(
     complaints.end()
     fixes, headings, near = gathered.fixes, gathered.headings, inputs.near_of(args)
     whole = together(gathered, answers.given, near)
-    mean, why = (None, ()) if place is None else fix_output.mean_of(headings)
-    unnamed = () if watched is None or answers.instrument is None else of_inclinometer(answers.instrument)
-    not_averaged = [whole.why_not] if whole.why_not else []
-    say(folder, *not_averaged, *(unnamed if fixes else ()), *whole.remarks, *why)
+    mean, why = (None, "") if place is None else fix_output.mean_of(headings)
+    unnamed = ""
+    if fixes and watched is not None and answers.instrument is not None:
+        unnamed = unnamed_inclinometer(answers.instrument)
+    say(folder, whole.why_not, unnamed, *whole.remarks, why)
     where, about = whole.average or (fixes[-1] if fixes else None), {}
     if where is not None:
         options.tell_unknown(args, vertical.at(where.latitude, where.longitude))
@@ -86,7 +88,7 @@ def tell(
     if where is not None or (headings and place is not None):
         fix_output.put_combined(output, folder, whole.average, gathered, vertical, about, mean)
     elif gathered.lost is not None and not headings and work is not None:
-        say(folder, *work.fitting(gathered.lost))
+        say(folder, work.fitting(gathered.lost))
     # without tilts headings are all that was asked for, and by day they are all there is
     by_day = any(s.bodies for s in headings)
     found = bool(headings) if place is not None and (by_day or not args.tilt) else whole.average is not None
@@ -143,7 +145,7 @@ def tell_turned(args: argparse.Namespace, folder: str | None, turned: TurnedNigh
 
 def say(folder: str | None, *texts: object) -> None:
     """Print lines about a whole night on standard error."""
-    for text in texts:
+    for text in filter(None, texts):
         console.complain(text if folder is None else f"{folder}: {text}")
 
 
@@ -235,7 +237,7 @@ def _from_elevations(
         )
     if args.save is not None:
         saving = _save_axis(args, solver, found.axis)
-    say(None, *([whole.why_not] if whole.why_not else ()), *whole.remarks)
+    say(None, whole.why_not, *whole.remarks)
     place, about = whole.average, {}
     if place is not None:
         options.tell_unknown(args, vertical.at(place.latitude, place.longitude))

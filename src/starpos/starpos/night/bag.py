@@ -20,7 +20,6 @@ from starpos.messages.tilt import UNUSABLE, message_to_tilt
 from starpos.night.night import Truth
 from starpos.night.opening import truth_in
 from starpos.night.reading import Instruments
-from starpos.night.remarks import Remark
 from starpos.night.solving import Exposures, Worked
 from starpos.night.work import Solving
 from starpos.progress import Progress
@@ -51,7 +50,7 @@ class Recorded:
     tilts: TiltLog | None
     star_count: int
     truth: Truth | None
-    remarks: tuple[Remark, ...]
+    remarks: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -160,15 +159,14 @@ class _Reading:
         in_time = sorted(self._tilts, key=lambda tilt: tilt.utc_unix_s)
         return TiltLog.of_readings(in_time) if in_time else None
 
-    def remarks(self, path: Path, made: str) -> tuple[Remark, ...]:
+    def remarks(self, path: Path, made: str) -> tuple[str, ...]:
         """Remarks on left-out messages, and on how a robot's own messages were used."""
-        said = [Remark(f"{path.name}: {made}")] if made else []
-        said += [Remark(sentence) for sentence in self._messages.remarks()]
+        said = [f"{path.name}: {made}"] if made else []
+        said += self._messages.remarks()
         if self._unusable:
-            sentence = f"{self._unusable} tilts of the bag were left out: flagged, out of range or broken"
-            said.append(Remark(sentence))
+            said.append(f"{self._unusable} tilts of the bag were left out: flagged, out of range or broken")
         if self._why_no_camera and not self.cameras:
-            said.append(Remark(f"{path.name}: {self._why_no_camera}"))
+            said.append(f"{path.name}: {self._why_no_camera}")
         return tuple(said)
 
 

@@ -14,7 +14,6 @@ from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssWatch
 from starpos.instrument.tilt_log import Tilts
-from starpos.night.remarks import Remark
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class WatchedNight:
 
     answers: tuple[Watched, ...]
     learned: Learned | None
-    remarks: tuple[Remark, ...]
+    remarks: tuple[str, ...]
 
 
 def watched_night(
@@ -58,5 +57,5 @@ def watched_night(
         if gnss is not None:
             rough = placed(solver, stars, rough, gnss.deflected(vertical))
         answers[k] = watched(solver, stars, rough, gnss, watch)
-    remarks = tuple(Remark(f"{number} frames: {why}") for why, number in said.items())
+    remarks = tuple(f"{number} frames: {why}" for why, number in said.items())
     return WatchedNight(tuple(answers[k] for k in range(len(sights))), watch.learned, remarks)

@@ -15,7 +15,6 @@ from starpos.fix.fix import InDegrees, PlaceFix
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import FieldPointing, Solution, Status
 from starpos.frames.frame import Stars
-from starpos.night.remarks import Remark
 
 if TYPE_CHECKING:
     from starpos.night.beside_gnss import WatchedNight
@@ -162,7 +161,7 @@ class Night:
     truth: Truth | None = None
     steady: np.ndarray | None = None
     watched: "WatchedNight | None" = None
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def simulated(self) -> bool:

@@ -26,7 +26,7 @@ from starpos.instrument.phone_log import is_phone_log
 from starpos.instrument.tilt_log import Tilts, TiltsByTime
 from starpos.night.night import Night, Truth
 from starpos.night.reading import About, First, Instruments, Reader, TiltFile
-from starpos.night.remarks import Remark, of_gravity, of_tilts
+from starpos.night.remarks import of_gravity, of_tilts
 from starpos.night.solving import Exposures, How, Worked, solved_night
 from starpos.night.work import OnFile, Solving
 from starpos.parallel.processes import Here
@@ -65,13 +65,14 @@ def exposures(
         tilts, read = ByGravity(), Reader(read.clock or CameraClock(), read.delay_s)
     by_gravity = isinstance(tilts, ByGravity)
     first = First(read, by_gravity)(tuple(map(str, frames)))
-    work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[Remark, ...]()
+    work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[str, ...]()
     if first is not None:
         try:
             work, remarks = work_of(given, first, tilts, atmosphere, place)
         except TiltError as error:
             none = place is not None and not (folder / TILTS).exists()
-            instruments, remarks = given.framed(first)
+            instruments, doubt = given.framed(first)
+            remarks = (doubt,) if doubt else ()
             work = replace(work, instruments=instruments, tilts=None if none else TiltsByTime(why=str(error)))
 
     def each(work: Callable[[Frame | Stars], Any]) -> Worked:
@@ -97,13 +98,13 @@ def work_of(
     tilts: Path | ByGravity | None,
     atmosphere: Atmosphere,
     place: Place | None = None,
-) -> tuple[Solving, tuple[Remark, ...]]:
+) -> tuple[Solving, tuple[str, ...]]:
     """The work on the frames of a night whose first one is known, and what looks wrong.
 
     tilts: their table, or that photographs have their own; None where none is needed.  Raises TiltError if the table
     cannot be read.
     """
-    known, own = given.instrument, tuple[Remark, ...]()
+    known, own = given.instrument, ["", ""]
     by_log = isinstance(tilts, Path) and is_phone_log(tilts) and first.upper_edge is not None
     # a telephone's log has its camera's axes, unless another A3 is stated
     by_log = by_log and (known is None or known.calibration.unknown)
@@ -111,8 +112,8 @@ def work_of(
         model = PHONE if by_log or first.gravity is None else first.gravity.model
         known = None if known is None else known.levelled_by(model)
         if known is not None and (by_log or first.gravity is not None):
-            own = of_gravity(known, by_log)
-    instruments, remarks = replace(given, instrument=known).framed(first)
+            own[0] = of_gravity(known, by_log)
+    instruments, doubt = replace(given, instrument=known).framed(first)
     level: Tilts | None = None if isinstance(tilts, Path) else tilts
     if isinstance(tilts, ByGravity) and first.gravity is not None:
         level = replace(tilts, camera=first.gravity.camera)
@@ -120,9 +121,10 @@ def work_of(
         known = instruments.instrument
         errors = sensors.unnamed() if known is None else known.inclinometer
         table = TiltFile(os.path.abspath(tilts), errors.noise_rad)
-        own = (*own, *of_tilts(table.log, str(tilts), errors))
+        own[1] = of_tilts(table.log, str(tilts), errors)
         level = ByGravity(table) if by_log else table
-    return Solving(instruments, atmosphere=atmosphere, tilts=level, places=place), (*own, *remarks)
+    work = Solving(instruments, atmosphere=atmosphere, tilts=level, places=place)
+    return work, tuple(filter(None, (*own, doubt)))
 
 
 def frames_in(folder: Path) -> list[Path]:

@@ -20,7 +20,6 @@ from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument, with_frame_size
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
-from starpos.night.remarks import Remark
 
 
 @dataclass(frozen=True)
@@ -126,13 +125,13 @@ class Instruments:
     any_size: bool = True
     sought: bool = False
 
-    def framed(self, first: About) -> tuple["Instruments", tuple[Remark, ...]]:
-        """Instruments of a night with this first frame, and a remark if the optical axis of its frames is not known."""
+    def framed(self, first: About) -> tuple["Instruments", str]:
+        """Instruments of a night with this first frame, and a remark if the axis of its frames is not known, else ''."""
         # a lens that is sought may be another one in each frame
         if self.instrument is None or self.sought:
-            return self, ()
+            return self, ""
         instrument, doubt = with_frame_size(self.instrument, first)
-        return replace(self, instrument=instrument), (Remark(doubt),) if doubt else ()
+        return replace(self, instrument=instrument), doubt
 
     def of(self, frame: Frame | Stars) -> Instrument | None:
         """The instrument of a frame; None if its focal length is unknown."""

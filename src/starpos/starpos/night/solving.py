@@ -23,7 +23,6 @@ from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS
 from starpos.night.night import Night, Shot, Truth, why_none
-from starpos.night.remarks import Remark
 from starpos.night.together import FrameAnswer, Gathered, TurnedNight, together, turned
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
@@ -54,7 +53,7 @@ class Exposures:
     work: Solving
     vertical: Vertical
     truth: Truth | None = None
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -196,15 +195,14 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
     for done, answer in enumerate(answers.each, 1):
         gathered.gather(answer)
         shots.append(Shot.of(answer.name, answer.solution, answer.stars))
-        if answer.solution.remark:
-            of_frames.append(Remark(answer.solution.remark))
+        of_frames.append(answer.solution.remark)
         progress(exposures.name[:20], done / exposures.count)
     whole = together(gathered, answers.given)
     said = [
         remark for part in (answers.turned, answers.watched) if part is not None for remark in part.remarks
     ]
     if gathered.lost is not None and not gathered.solved:
-        of_frames += work.fitting(gathered.lost)
+        of_frames.append(work.fitting(gathered.lost))
     night = Night(
         name=exposures.name,
         origin=exposures.origin,
@@ -215,7 +213,7 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
         atmosphere=exposures.work.atmosphere,
         truth=exposures.truth,
         watched=answers.watched,
-        remarks=(*exposures.remarks, *said, *of_frames, *whole.remarks),
+        remarks=(*exposures.remarks, *said, *filter(None, of_frames), *whole.remarks),
     )
     if night.combined is None or answers.instrument is None:
         return night

@@ -24,7 +24,6 @@ from starpos.instrument import instrument_file
 from starpos.instrument.instrument import ByGravity, Instrument, with_frame_size
 from starpos.instrument.tilt_log import Tilts
 from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
-from starpos.night.remarks import Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
 from starpos.sky.bodies import ERFA, SolarSystem
@@ -214,16 +213,14 @@ class Solving:
             answer = placed(solver, sight.stars, answer, self.places)
         return replace(sight, solution=answer)
 
-    def fitting(self, lost: Stars) -> tuple[Remark, ...]:
-        """Say which focal length fits a frame that was not identified with the given one."""
+    def fitting(self, lost: Stars) -> str:
+        """Say which focal length fits a frame that was not identified with the given one; '' if none is known."""
         instrument = self.instruments.of(lost)
         # without its header's focal length a frame was searched already
         if instrument is None or self.instruments.by_header:
-            return ()
+            return ""
         focal_px = searching.focal_px_that_fits(self.solver(lost), lost)
-        if focal_px is None:
-            return ()
-        return (Remark(searching.other_focal_length(lost.place, focal_px)),)
+        return "" if focal_px is None else searching.other_focal_length(lost.place, focal_px)
 
 
 def identify(

@@ -26,8 +26,11 @@ from starpos.parallel import BLAS_THREADS
 
 # Calls for each process whose answers may wait for an earlier one.
 AHEAD = 4
-# There is a process for each processor, so the libraries need no threads of their own.
-ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
+# There is a process for each processor, so the libraries need no threads of their own. If the parent was killed, Python's
+# tracker removes its semaphores, and need not say so.
+INHERITED = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1") | {
+    "PYTHONWARNINGS": "ignore::UserWarning:multiprocessing.resource_tracker"
+}
 
 Files = str | tuple[str, ...]
 # The work and its argument, which can be pickled: a file or files, or anything else.
@@ -113,7 +116,9 @@ class Processes:
     def __enter__(self) -> "Processes":
         context = get_context("spawn")
         theirs, self._lifeline = context.Pipe(duplex=False)
-        self._pool = ProcessPoolExecutor(self._number, context, _end_with, (theirs,))
+        # Python's tracker of semaphores starts here
+        with _for_one_that_starts():
+            self._pool = ProcessPoolExecutor(self._number, context, _end_with, (theirs,))
         self._theirs = theirs
         return self
 
@@ -188,7 +193,7 @@ def _for_one_that_starts() -> Iterator[None]:
     A terminal sends Ctrl-C to all processes; only the parent is to react.  Windows has no masks of signals.
     """
     before = dict(os.environ)
-    os.environ.update({name: one for name, one in ONE_THREAD.items() if name not in before})
+    os.environ.update({name: one for name, one in INHERITED.items() if name not in before})
     masks = hasattr(signal, "pthread_sigmask")
     if masks:
         # otherwise it starts with the first process, and unblocks SIGINT for it
@@ -199,7 +204,7 @@ def _for_one_that_starts() -> Iterator[None]:
     finally:
         if masks:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for name in ONE_THREAD.keys() - before.keys():
+        for name in INHERITED.keys() - before.keys():
             del os.environ[name]
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from starpos.errors import CatalogueError, FrameError
-from starpos.parallel.processes import AHEAD, ONE_THREAD, Here, ProcessError, Processes
+from starpos.parallel.processes import AHEAD, INHERITED, Here, ProcessError, Processes
 
 # the work, which goes to other processes by name
 
@@ -55,7 +55,7 @@ def surroundings(of):
     import cv2
 
     blocked = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    return {name: os.environ[name] for name in ONE_THREAD}, cv2.getNumThreads(), blocked
+    return {name: os.environ[name] for name in INHERITED}, cv2.getNumThreads(), blocked
 
 
 def test_answers_come_in_order_and_no_more_is_asked_for_than_is_worked():
@@ -140,11 +140,11 @@ def test_what_a_process_warns_of_is_heard():
 
 
 def test_a_process_takes_one_processor_and_leaves_ctrl_c_to_its_parent(monkeypatch):
-    for name in ONE_THREAD:
+    for name in INHERITED:
         monkeypatch.delenv(name, raising=False)
     before = dict(os.environ), signal.pthread_sigmask(signal.SIG_BLOCK, ())
     with Processes(1) as workers:
-        assert list(workers.map([(surroundings, 0)])) == [(ONE_THREAD, 1, True)]
+        assert list(workers.map([(surroundings, 0)])) == [(INHERITED, 1, True)]
     assert (dict(os.environ), signal.pthread_sigmask(signal.SIG_BLOCK, ())) == before
 
 
