@@ -39,7 +39,7 @@ from starpos.instrument.tilt_log import TiltLog
 from starpos.night import horizon
 from starpos.night.extinction import light_of
 from starpos.night.opening import frames_in
-from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
+from starpos.night.reading import NO_CAMERA, Instruments, Reader
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_left_out
 from starpos.night.together import axis_of, circles_of
 from starpos.night.watching import Answer, kept, night_poses, sky_mag
@@ -245,7 +245,7 @@ def run(args: argparse.Namespace) -> int:
     if args.pointings is not None:
         return _from_pointings(args)
     read, args.frames = reader_of(args), frames_among(args.frames, args.tilt)
-    first = First(read)(tuple(args.frames))
+    first = read.first(args.frames)
     if first is None:
         # each frame says why it cannot be read
         _sights(args.frames, read, Instruments(None))

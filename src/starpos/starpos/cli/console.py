@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from multiprocessing import parent_process
 from typing import Any
 
 import numpy as np
@@ -103,7 +104,8 @@ class ProgressBar:
 
     def __call__(self, what: str, done: float) -> None:
         soon = time.monotonic() - self.begin < BAR_AFTER_S and not self.shown
-        if soon or not sys.stderr.isatty():
+        # several processes would write over each other's
+        if soon or not sys.stderr.isatty() or parent_process() is not None:
             return
         self.shown = True
         filled = int(30 * min(done, 1.0))

@@ -2,8 +2,8 @@
 """`starpos deflection`: the deflection of the vertical at a known site, from a zenith camera's frames and tilts."""
 
 import argparse
-import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +13,11 @@ from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, InstrumentError, TiltError
 from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.solution import Solution
-from starpos.instrument.instrument import Instrument, with_frame_size
-from starpos.night.at_mark import ZenithSighted
+from starpos.instrument.instrument import Instrument
+from starpos.night.at_mark import sighted
 from starpos.night.bag import each_frame, is_bag
-from starpos.night.reading import First
-from starpos.night.work import OnFile
+from starpos.night.opening import work_of
+from starpos.night.work import Solving
 from starpos.units import ARCSEC, utc_text
 from starpos.zenith.adjustment import DeflectionSession, FaceQuality, Reduced, reduced
 from starpos.zenith.doubts import checked_session, remarks
@@ -137,8 +137,7 @@ def _face_text(face: dict) -> str:
 
 def run(args: argparse.Namespace) -> int:
     mark = _mark_of(args)
-    taken = _of_bag(args, mark) if _is_bag(args) else _of_files(args, mark)
-    return console.UNREADABLE if taken is None else _tell(args, taken, mark)
+    return _tell(args, _of_bag(args, mark) if _is_bag(args) else _of_files(args, mark), mark)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,26 +149,24 @@ class _Taken:
     instrument: Instrument
 
 
-def _of_files(args: argparse.Namespace, mark: Place) -> _Taken | None:
-    """The sightings of files; None where no frame can be read, which has been said."""
+def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
+    """The sightings of files."""
     if not args.frames or args.tilt is None:
         raise InstrumentError("give frames and --tilt CSV, or a bag")
-    read = inputs.reader_of(args)
-    frames = inputs.frames_among(args.frames, args.tilt)
-    with inputs.workers_of(args, frames) as workers:
-        (about,) = workers.map([(First(read), tuple(frames))])
-        if about is None:
-            # says why
-            read(frames[0])
-            return None
-        instrument, doubt = with_frame_size(options.instrument_of(args, about), about)
-        console.complain(doubt)
-        given = replace(inputs.given_of(args, about), instrument=instrument)
-        tilts = inputs.checked_tilts(os.path.abspath(args.tilt), instrument)
-        inputs.prepare(instrument, about)
-        work = OnFile(read, ZenithSighted(given, options.atmosphere_of(args), tilts, mark))
-        answers = list(inputs.watched(workers.map((work, path) for path in frames), len(frames), lines=False))
-    return _Taken(frames, answers, instrument)
+    read, frames = inputs.reader_of(args), inputs.frames_among(args.frames, args.tilt)
+    about = read.first(frames)
+    if about is None:
+        # says why
+        read(frames[0])
+    assert about is not None
+    air = options.atmosphere_of(args)
+    given, remarks = work_of(inputs.given_of(args, about), about, Path(args.tilt), air)
+    console.complain(*remarks)
+    instrument = given.instruments.instrument
+    assert instrument is not None
+    inputs.prepare(instrument, about)
+    work = partial(read.on, partial(sighted, given, mark))
+    return _Taken(frames, list(inputs.worked(args, work, frames, lines=False)), instrument)
 
 
 def _is_bag(args: argparse.Namespace) -> bool:
@@ -190,11 +187,11 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
         raise TiltError(f"{path}: no usable tilt in it: record the topic tilt too")
     if not found.star_count:
         raise FrameError(f"{path}: no stars and no images in it: record the topic stars too")
-    work = ZenithSighted(instruments, options.atmosphere_of(args), found.tilts, mark)
+    given = Solving(instruments, atmosphere=options.atmosphere_of(args), tilts=found.tilts)
     names, answers = [], []
     for name, item in inputs.watched(each_frame(found), found.star_count, lines=False):
         names.append(name)
-        answers.append(item if isinstance(item, FrameError) else work(item))
+        answers.append(item if isinstance(item, FrameError) else sighted(given, mark, item))
     assert instruments.instrument is not None
     return _Taken(names, answers, instruments.instrument)
 

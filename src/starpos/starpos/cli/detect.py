@@ -2,13 +2,14 @@
 """`starpos detect`: the stars of frames."""
 
 import argparse
+from functools import partial
 from typing import TYPE_CHECKING
 
 from starpos.cli import console, inputs
 from starpos.errors import FrameError
 from starpos.frames.frame import Stars
 from starpos.night.reading import Reader
-from starpos.night.work import OnFile, detected
+from starpos.night.work import detected
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
@@ -20,13 +21,11 @@ COLUMNS = ("file", "x", "y", "flux", "snr", "sigma_x", "sigma_y", "flags")
 def run(args: argparse.Namespace) -> int:
     output = console.Output(args, COLUMNS, "")
     args.frames = inputs.frames_among(args.frames)
-    status, work, number = 0, OnFile(Reader(), detected), len(args.frames)
-    with inputs.workers_of(args, args.frames) as workers:
-        answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
-        for path, answer in zip(args.frames, answers, strict=True):
-            if isinstance(answer, FrameError):
-                status = console.UNREADABLE
-            _tell(path, answer, output)
+    status, answers = 0, inputs.worked(args, partial(Reader().on, detected), args.frames)
+    for path, answer in zip(args.frames, answers, strict=True):
+        if isinstance(answer, FrameError):
+            status = console.UNREADABLE
+        _tell(path, answer, output)
     return status
 
 

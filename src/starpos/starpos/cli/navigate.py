@@ -4,6 +4,7 @@
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from starpos.instrument.instrument import framed
 from starpos.navigation.estimate import VoyageFix
 from starpos.navigation.voyage import Voyage
 from starpos.night import under_way
-from starpos.night.reading import First
 
 OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "bad input"
 # the keys of --json that come from a fix
@@ -36,7 +36,7 @@ COLUMNS = ("file", "status", *(k for k in KEYS if not k.startswith("covariance")
 
 def run(args: argparse.Namespace) -> int:
     args.frames = inputs.frames_among(args.frames, args.imu, args.velocity)
-    vertical, read, number = options.vertical_of(args), inputs.reader_of(args), len(args.frames)
+    vertical, read = options.vertical_of(args), inputs.reader_of(args)
     records = under_way.Records(
         imu=args.imu,
         imu_model=args.imu_model,
@@ -46,17 +46,16 @@ def run(args: argparse.Namespace) -> int:
         drift_stddev=args.drift_stddev,
         height_m=args.altitude_m,
     )
-    with inputs.workers_of(args, args.frames) as workers:
-        (about,) = workers.map([(First(read), tuple(args.frames))])
-        if about is None:
-            raise VoyageError(f"none of the {number} frames can be read: give star lists or frames")
-        instrument, axis = framed(options.instrument_of(args, about), about)
-        vessel, remark = records.vessel(instrument, options.atmosphere_of(args), axis)
-        console.complain(remark)
-        inputs.prepare(instrument, about)
-        work = under_way.IdentifyingVoyage(read, replace(inputs.given_of(args, about), instrument=instrument))
-        answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
-        frames = under_way.voyage_frames(answers)
+    about = read.first(args.frames)
+    if about is None:
+        raise VoyageError(f"none of the {len(args.frames)} frames can be read: give star lists or frames")
+    instrument, axis = framed(options.instrument_of(args, about), about)
+    vessel, remark = records.vessel(instrument, options.atmosphere_of(args), axis)
+    console.complain(remark)
+    inputs.prepare(instrument, about)
+    given = replace(inputs.given_of(args, about), instrument=instrument)
+    work = partial(read.on, partial(under_way.voyage_frame, given))
+    frames = under_way.voyage_frames(inputs.worked(args, work, args.frames))
     for frame in frames:
         console.complain(frame.message)
     try:

@@ -18,7 +18,6 @@ from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument import instrument, instrument_file, platepar, sensors
 from starpos.instrument.camera import PLUMB_BOB, Camera
-from starpos.night.reading import About
 from starpos.sky.bodies import ERFA, JplKernel, SolarSystem
 
 
@@ -90,7 +89,7 @@ def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
     return Atmosphere.measured(pressure_pa, args.temperature_c, args.humidity, args.wavelength_um)
 
 
-def instrument_of(args: argparse.Namespace, first: About | Frame | Stars | None) -> instrument.Instrument:
+def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> instrument.Instrument:
     """The instrument from --instrument, or from --focal-mm and --pixel-um, or from the first frame's header.
 
     Raises InstrumentError if the options do not fit together or there is no focal length.

@@ -22,12 +22,11 @@ def run(args: argparse.Namespace) -> int:
     # a wrong parameter is reported once, not for each bag
     Drivers.of(args.params_file, args.param, args.namespace)
     work = Playing(args.params_file, tuple(args.param), args.namespace, remaps_of(args.remap))
-    with inputs.workers_of(args, args.bags) as workers:
-        answers = inputs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
-        return max(
-            tell(args, output, bag, night, settings.vertical)
-            for bag, night in zip(args.bags, answers, strict=True)
-        )
+    answers = inputs.worked(args, work, args.bags, "bag")
+    return max(
+        tell(args, output, bag, night, settings.vertical)
+        for bag, night in zip(args.bags, answers, strict=True)
+    )
 
 
 def tell(

@@ -13,7 +13,7 @@ from starpos.errors import FrameError, InstrumentError
 from starpos.frames.reading import are_photographs
 from starpos.night.night import Night
 from starpos.night.opening import exposures, frames_in
-from starpos.night.reading import First, Instruments
+from starpos.night.reading import Instruments
 from starpos.night.solving import Exposures, How, solved_night
 from starpos.parameters.given import of_solver
 from starpos.sky import catalogue
@@ -133,7 +133,7 @@ def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
             f"{path}: neither a folder of frames nor a rosbag2 (.mcap, .db3), nor a photograph: give one of these"
         )
     read, folder = inputs.reader_of(args), path.parent if frames else path
-    about = First(read)(tuple(map(str, frames or frames_in(path))))
+    about = read.first(list(map(str, frames or frames_in(path))))
     # a field report states the focal length
     find = inputs.given_or_sought if args.field is None else inputs.given_of
     given = Instruments(None) if about is None else find(args, about)

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from starpos.fix.searching import Sight
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.gnss.receiver import gnss_place, read_gnss_csv
-from starpos.night.work import OnFile, TrailSighted
+from starpos.night.work import trails_seen
 from starpos.satellites.adjustment import KnownBefore
 from starpos.satellites.elements import Orbit, chosen, read_orbits
 from starpos.satellites.locating import SatelliteFix, locate
@@ -111,21 +112,18 @@ def _look(args: argparse.Namespace, frames: list[str], seen: SeenTrails) -> None
     """Add the frames and their trails, numbered on; complains of frames without, and of trails that are left out."""
     number = 1 + max((trail.track for trail in seen.trails), default=-1)
     complaints, read = console.FrameComplaints(), inputs.reader_of(args)
-    with inputs.workers_of(args, frames) as workers:
-        solving = inputs.identifying(args, frames, read, workers, SEARCH_S)
-        work = OnFile(read, TrailSighted(solving))
-        answers = inputs.watched(workers.map((work, path) for path in frames), len(frames))
-        for path, answer in zip(frames, answers, strict=True):
-            if isinstance(answer, FrameError):
-                complaints(path, str(answer))
-            elif isinstance(answer, Solution):
-                complaints(path, answer.message)
-            else:
-                seen.frames[path], found = answer
-                if found.left_out:
-                    complaints(path, found.left_out)
-                seen.trails += [replace(t, track=number + k, file=path) for k, t in enumerate(found.trails)]
-                number += len(found.trails)
+    work = partial(read.on, partial(trails_seen, inputs.identifying(args, frames, read, SEARCH_S)))
+    for path, answer in zip(frames, inputs.worked(args, work, frames), strict=True):
+        if isinstance(answer, FrameError):
+            complaints(path, str(answer))
+        elif isinstance(answer, Solution):
+            complaints(path, answer.message)
+        else:
+            seen.frames[path], found = answer
+            if found.left_out:
+                complaints(path, found.left_out)
+            seen.trails += [replace(t, track=number + k, file=path) for k, t in enumerate(found.trails)]
+            number += len(found.trails)
     complaints.end()
 
 

@@ -5,6 +5,7 @@ import argparse
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from starpos.fix.blind import BlindSolver
 from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.solution import Solution, status_of
 from starpos.fix.solver import Solver
+from starpos.frames.frame import Stars
 from starpos.frames.reading import are_photographs
 from starpos.frames.tables import Pointing, read_pointings
 from starpos.instrument import instrument_file
@@ -27,11 +29,11 @@ from starpos.instrument.phone_log import is_phone_log
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night import field
 from starpos.night.opening import work_of
-from starpos.night.reading import NO_CAMERA, About, First, Instruments
+from starpos.night.reading import NO_CAMERA, Instruments
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near
 from starpos.night.solving import How, NightAnswers, answers_of
 from starpos.night.together import FrameAnswer, Gathered, TurnedNight, from_elevations, together, turned
-from starpos.night.work import OnFile, Solving
+from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
@@ -318,13 +320,13 @@ def _run(args: argparse.Namespace) -> int:
     statuses = [_refused(why, given) for why in given if not isinstance(why, inputs.NightFolder)]
     with inputs.workers_of(args, [path for night in nights for path in night.frames]) as workers:
         plans = []
-        abouts = workers.map((First(read, by_gravity), night.frames) for night in nights)
+        abouts = workers.map((partial(read.first, levelled=by_gravity), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):
             try:
                 plans.append((night, _work(args, night, about, own_level, place, by_gravity)))
             except TiltError as error:
                 statuses.append(_refused(error, given))
-        on_files = [OnFile(read, how.work(work)) for _, work in plans]
+        on_files = [partial(read.on, how.work(work)) for _, work in plans]
         calls = [(f, path) for f, (night, _) in zip(on_files, plans, strict=True) for path in night.frames]
         # the lines of a turn come at its end, and show no progress
         sights = inputs.watched(workers.map(calls), len(calls), lines=how.one_by_one)
@@ -349,7 +351,7 @@ def _refused(why: StarposError, given: list) -> int:
 def _work(
     args: argparse.Namespace,
     night: inputs.NightFolder,
-    about: About | None,
+    about: Stars | None,
     own_level: bool,
     place: Place | None,
     by_gravity: bool,

@@ -5,6 +5,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,10 +26,10 @@ from starpos.instrument.instrument import ByGravity, Calibration, Instrument
 from starpos.instrument.phone_log import is_phone_log
 from starpos.instrument.tilt_log import Tilts, TiltsByTime
 from starpos.night.night import Night, Truth
-from starpos.night.reading import About, First, Instruments, Reader, TiltFile
+from starpos.night.reading import Instruments, Reader, TiltFile
 from starpos.night.remarks import of_gravity, of_tilts
 from starpos.night.solving import Exposures, How, Worked, solved_night
-from starpos.night.work import OnFile, Solving
+from starpos.night.work import Solving
 from starpos.parallel.processes import Here
 from starpos.progress import Progress, quiet
 
@@ -64,7 +65,7 @@ def exposures(
         # a new reader, which has not kept a frame without its time
         tilts, read = ByGravity(), Reader(read.clock or CameraClock(), read.delay_s)
     by_gravity = isinstance(tilts, ByGravity)
-    first = First(read, by_gravity)(tuple(map(str, frames)))
+    first = read.first(list(map(str, frames)), by_gravity)
     work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[str, ...]()
     if first is not None:
         try:
@@ -76,7 +77,7 @@ def exposures(
             work = replace(work, instruments=instruments, tilts=None if none else TiltsByTime(why=str(error)))
 
     def each(work: Callable[[Frame | Stars], Any]) -> Worked:
-        answers = Here().map((OnFile(read, work), str(path)) for path in frames)
+        answers = Here().map((partial(read.on, work), str(path)) for path in frames)
         return zip((path.name for path in frames), answers, strict=True)
 
     kind = "lists of stars" if frames[0].suffix == ".csv" else "frames"
@@ -94,7 +95,7 @@ def exposures(
 
 def work_of(
     given: Instruments,
-    first: About,
+    first: Stars,
     tilts: Path | ByGravity | None,
     atmosphere: Atmosphere,
     place: Place | None = None,
@@ -243,7 +244,7 @@ class NightOnDisk:
         """
         given, sought = self.instrument, False
         if given is None:
-            first = First(Reader())(tuple(map(str, frames_in(self.folder))))
+            first = Reader().first(list(map(str, frames_in(self.folder))))
             # each frame's own counts; without any, the frame says so
             given = None if first is None or first.focal_px is None else Instrument(first.focal_px)
             if sought := first is not None and first.focal_px is None and first.gravity is not None:

@@ -2,8 +2,9 @@
 """A voyage from its frames and an IMU: frames are read and identified, then placed under way."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,16 @@ import numpy as np
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, InstrumentError, TimeError, VoyageError
 from starpos.fix.solver import Solver
+from starpos.frames.frame import Frame, Stars
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import AxisDoubt, Instrument, framed
 from starpos.navigation.records import ImuModel, read_imu, read_imu_model, read_velocity
 from starpos.navigation.sightings import IdentifiedFrame, sighting_of
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, adjust_voyage
-from starpos.night.reading import First, Instruments, Reader
+from starpos.night.reading import Instruments, Reader
 from starpos.night.work import Solving
+from starpos.parallel.processes import Here
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
 
@@ -36,23 +39,16 @@ class VoyageFrame:
     message: str = ""
 
 
-@dataclass(frozen=True)
-class IdentifyingVoyage:
-    """Work on the file of a frame, for any process: a VoyageFrame."""
-
-    read: Reader
-    given: Instruments
-
-    def __call__(self, path: str) -> VoyageFrame:
-        item = self.read(path)
-        sight = Solving(self.given)(item)
-        instrument = sight.instrument or self.given.of(item)
-        assert instrument is not None
-        eye, time_s = Solver(instrument, catalogue.load_catalogue()), item.mid_unix_s
-        try:
-            return VoyageFrame(time_s, sighting_of(sight.stars, eye, sight.solution), sight.solution.remark)
-        except (FrameError, TimeError) as error:
-            return VoyageFrame(time_s, None, str(error))
+def voyage_frame(given: Instruments, item: Frame | Stars) -> VoyageFrame:
+    """A frame, identified by every way there is."""
+    sight = Solving(given)(item)
+    instrument = sight.instrument or given.of(item)
+    assert instrument is not None
+    eye, time_s = Solver(instrument, catalogue.load_catalogue()), item.mid_unix_s
+    try:
+        return VoyageFrame(time_s, sighting_of(sight.stars, eye, sight.solution), sight.solution.remark)
+    except (FrameError, TimeError) as error:
+        return VoyageFrame(time_s, None, str(error))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +105,7 @@ class Records:
 
 
 def voyage_frames(answers: Iterable[VoyageFrame | FrameError]) -> list[VoyageFrame]:
-    """The answers of `IdentifyingVoyage`; a frame that cannot be read has only its sentence."""
+    """The answers of `voyage_frame`; a frame that cannot be read has only its sentence."""
     return [VoyageFrame(None, None, str(a)) if isinstance(a, FrameError) else a for a in answers]
 
 
@@ -156,7 +152,7 @@ def navigate(
     """
     paths, read = tuple(map(str, frames)), Reader()
     known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
-    about = First(read)(paths)
+    about = read.first(paths)
     if about is None:
         raise VoyageError(f"none of the {len(paths)} frames can be read: give star lists or frames")
     whole, axis = framed(known, about)
@@ -164,11 +160,6 @@ def navigate(
     vessel, _ = kept.vessel(
         whole, Atmosphere.measured(None, None) if atmosphere is None else atmosphere, axis
     )
-    work: Callable[[str], VoyageFrame] = IdentifyingVoyage(read, Instruments(whole))
-    answers: list[VoyageFrame | FrameError] = []
-    for path in paths:
-        try:
-            answers.append(work(path))
-        except FrameError as error:
-            answers.append(error)
+    work = partial(read.on, partial(voyage_frame, Instruments(whole)))
+    answers = Here().map((work, path) for path in paths)
     return kept.voyage(voyage_frames(answers), vessel, progress)
