@@ -157,7 +157,7 @@ def _figures(seen: _Seen) -> Iterator[np.ndarray]:
                     yield np.degrees(np.stack([azimuth, altitude], -1))
 
 
-def _shade(picture: np.ndarray, seen: _Seen, n: int, ground: np.ndarray) -> None:
+def _shade(picture: np.ndarray, seen: _Seen, n: float, ground: np.ndarray) -> None:
     """Darken the part of a picture (h, w, 3) below a horizon (N, 2) in deg."""
     y, x = np.mgrid[: picture.shape[0], : picture.shape[1]]
     xy = (np.stack([x.ravel(), y.ravel()], -1) + 0.5) * n - 0.5
@@ -167,20 +167,12 @@ def _shade(picture: np.ndarray, seen: _Seen, n: int, ground: np.ndarray) -> None
     picture[below] = picture[below] // 3
 
 
-def _enlarged(
-    frame: Frame, stars: Stars, seen: _Seen, points: np.ndarray, n: int
-) -> tuple[Frame, Stars, _Seen, np.ndarray]:
-    """Enlarge a frame and what lies on it n times, so that there is room for names and numbers."""
-    width, height, c = n * frame.width, n * frame.height, seen.camera
-    camera = replace(
-        c.scaled(n), width=width, height=height, cx=(c.cx + 0.5) * n - 0.5, cy=(c.cy + 0.5) * n - 0.5
-    )
+def _enlarged(frame: Frame, stars: Stars, n: int) -> tuple[Frame, Stars]:
+    """Enlarge a frame and its stars n times, so that there is room for names and numbers."""
     x, y = ((v + 0.5) * n - 0.5 for v in (stars.x, stars.y))
     return (
         replace(frame, pixels=frame.pixels.repeat(n, 0).repeat(n, 1)),
-        replace(stars, width=width, height=height, x=x, y=y),
-        replace(seen, camera=camera),
-        (points + 0.5) * n - 0.5,
+        replace(stars, width=n * frame.width, height=n * frame.height, x=x, y=y),
     )
 
 
@@ -195,19 +187,20 @@ def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None)
         raise InstrumentError(
             f"{path}: a list of stars has no picture to draw on: give a frame for --overlay"
         )
-    if not frame.pattern and (larger := SMALLEST_PX // max(frame.width, frame.height)) > 1:
-        frame, stars, seen, points = _enlarged(frame, stars, seen, points, larger)
+    larger = 1 if frame.pattern else max(SMALLEST_PX // max(frame.width, frame.height), 1)
+    frame, stars = _enlarged(frame, stars, larger)
     star, magnitudes = (np.zeros(0) if v is None else v for v in (solution.star, solution.magnitudes))
     named = Identified(star=star.astype(int).tolist(), names=solution.names, magnitudes=magnitudes.tolist())
     picture = annotate(frame, stars, named)
-    n = shrink(frame)
+    # pixels of the frame for one of the picture
+    n = shrink(frame) / larger
 
     def line(directions: np.ndarray) -> np.ndarray:
         """Points (N, 2) of the picture where azimuths and altitudes (N, 2) in deg are."""
         return (seen.pixels(np.radians(directions)) + 0.5) / n - 0.5
 
     if ground is not None:
-        _shade(picture[: seen.camera.height // n], seen, n, ground)
+        _shade(picture[: int(seen.camera.height / n)], seen, n, ground)
     round_, up = np.arange(0, 360 + ALONG, ALONG), np.arange(0, 90, ALONG)
     grid = [(np.stack([round_, np.full_like(round_, a)], -1), GRID) for a in ALTITUDES]
     grid += [(np.stack([np.full_like(up, a), up], -1), GRID) for a in AZIMUTHS]

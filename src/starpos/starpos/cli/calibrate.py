@@ -17,7 +17,6 @@ from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameter
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
 from starpos.cli import console, inputs, options, overwriting, places_file, watch_output
 from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of, stated_site
-from starpos.cli.options import vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
@@ -94,7 +93,7 @@ def run_site(
     known: identifications of the frames so far.
     """
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
-    site, bar = _site(args), console.ProgressBar()
+    site, bar = options.camera_place_of(args), console.ProgressBar()
     if tilts is None:
         sag = SAG_ARCSEC_PER_SQRT_HOUR if args.sag is None else args.sag
         found = calibrate_fixed(solver, frames, site, sag, bar, known)
@@ -131,7 +130,7 @@ def run_elevations(
     for row in circles_of(solver, pointings, tilts):
         if isinstance(row, StarposError):
             console.complain(f"left out: {row}")
-    site = _site(args)
+    site = options.camera_place_of(args)
     found = axis_of(solver, pointings, tilts, site=site)
     console.complain(of_left_out(found.left_out), unnamed_inclinometer(instrument))
     scatter = np.sqrt(1 + found.scatter2)
@@ -159,13 +158,6 @@ def _save(args: argparse.Namespace, found: Calibrated, about: str) -> None:
         instrument = replace(instrument, calibration=lasting)
     save_instrument(args.output, instrument, about, camera_found=args.camera is not None)
     console.tell(args, _json_of_site(found, args.output), about.rstrip())
-
-
-def _site(args: argparse.Namespace) -> Place:
-    if args.geodetic:
-        latitude_deg, longitude_deg = args.site
-        return Place.on_ellipsoid(latitude_deg, longitude_deg, vertical_of(args))
-    return Place.by_gravity(*args.site)
 
 
 def _text_of(site: Place) -> str:
@@ -212,8 +204,6 @@ def _json_of_site(found: Calibrated, path: str) -> dict:
     }
 
 
-# Exit status.
-NOTHING = 1
 # elevations that scatter by more, in stated sigmas, contradict what is stated with them
 SCATTERED = 3.0
 # the stars of a frame, and their identification
@@ -279,7 +269,7 @@ def run(args: argparse.Namespace) -> int:
         console.complain(e)
         if not _known(frames):
             console.complain(Solving(replace(given, instrument=instrument)).fitting(frames[0][0]))
-        return console.UNREADABLE if unreadable else NOTHING
+        return console.UNREADABLE if unreadable else console.NOTHING
     return console.UNREADABLE if unreadable else 0
 
 
@@ -289,12 +279,16 @@ def _watch(args: argparse.Namespace) -> int:
         raise FrameError("--watch names the folder of the nights: leave out the frames")
     args.frames = _frames_below(Path(args.watch))
     overwriting.check(args, page=places_file.check_ours, horizon=overwriting.never)
-    site = _site(args)
+    site = options.camera_place_of(args)
     answers, stars = [], []
     for item, sight, camera in inputs.seen_at(args, site):
-        sky = sky_mag(item, sight.stars, sight.solution, camera) if isinstance(item, Frame) else np.nan
-        light = light_of(sight.stars, sight.solution, camera)
-        answers.append(Answer(solution=sight.solution, focal_px=camera.fx, light=light, sky_mag=sky))
+        found = sight.solution
+        assert found.at_place is not None
+        sky = sky_mag(item, sight.stars, found, camera) if isinstance(item, Frame) else np.nan
+        light, number = light_of(sight.stars, found, camera), len(found.names)
+        answers.append(
+            Answer(at_place=found.at_place, stars=number, focal_px=camera.fx, light=light, sky_mag=sky)
+        )
         if args.horizon is not None:
             stars.append(horizon.expected(sight, camera, catalogue.load_catalogue()))
     nights = kept(night_poses(answers, site.longitude))
@@ -311,7 +305,7 @@ def _watch(args: argparse.Namespace) -> int:
         horizon.write(
             Path(args.horizon), horizon.horizon(stars, float(np.median(known)) if known else np.nan)
         )
-    return NOTHING if not nights or any(n.alarm for n in nights) else 0
+    return console.NOTHING if not nights or any(n.alarm for n in nights) else 0
 
 
 def _frames_below(folder: Path) -> list[str]:
@@ -369,7 +363,7 @@ def _from_pointings(args: argparse.Namespace) -> int:
             run_site(args, whole, instrument, tilts)
     except FixError as e:
         console.complain(e)
-        return NOTHING
+        return console.NOTHING
     return 0
 
 
@@ -408,7 +402,7 @@ def _camera(
     if tilts is not None:
         seen, levels = _levelled(seen, instrument, tilts)
     frames, bar = [stars for stars, _ in seen], console.ProgressBar()
-    site = _site(args) if args.site is not None and tilts is None else None
+    site = options.camera_place_of(args) if args.site is not None and tilts is None else None
     found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, bar, _known(seen), site)
     for k in sorted(set(range(len(frames))) - set(found.used)):
         console.complain(f"{frames[k].source}: no part of the sky matches it: it is left out")

@@ -213,7 +213,7 @@ def place_of(args: argparse.Namespace, vertical: Vertical) -> Place | None:
         if args.altitude_m is not None:
             raise InstrumentError("--site has a height, and --altitude-m another: give one")
         vertical = replace(vertical, height_m=args.site[2])
-    covariance = np.eye(2) * (args.site_stddev or 0.0) ** 2
+    covariance = np.eye(2) * (getattr(args, "site_stddev", None) or 0.0) ** 2
     make = Place.on_ellipsoid if args.geodetic else Place.by_gravity
     latitude_deg, longitude_deg, *_ = args.site
     return make(latitude_deg, longitude_deg, vertical, covariance)

@@ -18,7 +18,7 @@ from starpos.earth.vertical import Vertical
 from starpos.errors import InstrumentError, StarposError, TiltError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.checks import unnamed_inclinometer
-from starpos.fix.solution import Solution, status_of
+from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.frames.reading import are_photographs
@@ -79,10 +79,8 @@ def tell(
     if fixes and watched is not None and answers.instrument is not None:
         unnamed = unnamed_inclinometer(answers.instrument)
     say(folder, whole.why_not, unnamed, *whole.remarks, why)
-    where, about = whole.average or (fixes[-1] if fixes else None), {}
-    if where is not None:
-        options.tell_unknown(args, vertical.at(where.latitude, where.longitude))
-        about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
+    where = whole.average or (fixes[-1] if fixes else None)
+    about = fix_output.about_average(args, where, vertical, near)
     if place is not None:
         about |= fix_output.with_heading(
             fix_output.json_of(whole.average, vertical), mean, place, options.axes_of(args)
@@ -223,30 +221,17 @@ def _from_elevations(
     near: Near | None,
 ) -> int:
     """Print each row's zenith distance and the place that they give together; returns the exit status."""
-    found = from_elevations(solver, pointings, tilts, near, args.self_calibrate)
-    for p, circle in zip(pointings, found.circles, strict=True):
-        if isinstance(circle, StarposError):
-            console.complain(circle)
-            status = status_of(p, circle).value
-            fix_output.put_elevation(output, p.source, p.mid_unix_s, None, vertical, status)
-        else:
-            fix_output.put_elevation(output, p.source, p.mid_unix_s, circle.zenith_distance, vertical)
-    whole, saving = found.together, 0
+    found, saving = from_elevations(solver, pointings, tilts, near, args.self_calibrate), 0
+    status = fix_output.tell_elevations(
+        args, output, pointings, found.circles, found.together, vertical, near
+    )
     if found.axis is not None:
-        say(
-            None,
-            f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec",
+        console.complain(
+            f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec"
         )
     if args.save is not None:
         saving = _save_axis(args, solver, found.axis)
-    say(None, whole.why_not, *whole.remarks)
-    place, about = whole.average, {}
-    if place is not None:
-        options.tell_unknown(args, vertical.at(place.latitude, place.longitude))
-        about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
-    if place is not None or whole.why_not:
-        fix_output.put_combined(output, None, place, Gathered(), vertical, about)
-    return max(saving, 0 if place else console.NOTHING)
+    return max(saving, status)
 
 
 def _save_axis(args: argparse.Namespace, solver: Solver, axis: FoundAxis | None) -> int:

@@ -6,7 +6,6 @@ all.
 import base64
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from html import escape
 from pathlib import Path
 
@@ -96,26 +95,19 @@ PAGE = "index.html"
 
 
 def check_folder(folder: Path, page: str = PAGE) -> None:
-    """Raise WriteError, before a night is worked on, where its report could not be written; leaves nothing behind."""
-    made: list[Path] = []
+    """Make the folder of a report; WriteError, before a night is worked on, where the report could not be written."""
     try:
-        made = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
         _check_ours(folder / page)
     except (OSError, ValueError) as error:
         raise _refused(folder, error) from None
-    finally:
-        for path in made:
-            with suppress(OSError):
-                path.rmdir()
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write files by name; raises WriteError if one cannot be written, or would replace a file that is no report's."""
+    """Write files into a folder that is there; WriteError if it cannot, or if one is there and no report's."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         for name in files:
             _check_ours(folder / name)
         for name, content in files.items():
