@@ -27,11 +27,6 @@ from starpos.parameters.table import rows_of
 from starpos.tables import TableForm
 from starpos.units import utc_text
 
-COLUMNS = ("file", "utc", "x", "y", "azimuth", "altitude", "altitude_airless", "sigma_across_arcsec",
-           "sigma_altitude_arcsec")  # fmt: skip
-HEAD = (
-    "pixel x, y: azimuth (deg, from north over east), altitude as seen and without air, 1 sigma across and up"
-)
 POINTS = TableForm(what="table of pixels", error=FrameError, needed=("x", "y"))
 # an identified star at this share of a point's distance from the axis, or more, shows the lens there
 REACH = 0.95
@@ -98,7 +93,7 @@ class _Seen:
 
 def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
     """Print the azimuth and altitude of pixels (N, 2)."""
-    output, found = console.Output(args, COLUMNS, HEAD), seen.at_place
+    output, found = console.Output(args, "pixels"), seen.at_place
     rays = seen.camera.directions(*points.T)
     sigma = np.hypot(args.stddev_px, found.jitter_px) / seen.camera.fx
     at = horizontal(seen.optics, rays, sigma)
@@ -118,7 +113,7 @@ def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
     )
     for row in np.transpose(columns).tolist():
         x, y, azimuth, altitude, without, across, up = row
-        values = dict(zip(COLUMNS, (args.frame, utc_text(found.utc_unix_s), *row), strict=True))
+        values = dict(zip(output.columns, (args.frame, utc_text(found.utc_unix_s), *row), strict=True))
         output.put(
             values,
             f"{x:.2f} {y:.2f}: {azimuth:.4f} {altitude:.4f} ({without:.4f}) "

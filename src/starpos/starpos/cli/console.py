@@ -11,10 +11,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from multiprocessing import parent_process
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from starpos.parameters.table import rows_of
+
+OUTPUTS = Path(__file__).with_name("data") / "outputs.yaml"
 # Exit status: no answer; input that cannot be read.
 NOTHING, UNREADABLE = 1, 2
 # s of work that needs no bar
@@ -121,13 +125,13 @@ class ProgressBar:
 class Output:
     """Writes one answer after another; the first line describes them, except in JSON.
 
-    columns: keys of the answers that are columns of the CSV.  head: the first line for people.
-    answers: all that were written.
+    kind: a row of data/outputs.yaml.  answers: all that were written.
     """
 
-    def __init__(self, args: argparse.Namespace, columns: Sequence[str], head: str) -> None:
-        self._json, self._head = args.json, head
-        self._rows = csv.DictWriter(sys.stdout, columns, extrasaction="ignore", lineterminator="\n")
+    def __init__(self, args: argparse.Namespace, kind: str) -> None:
+        self._json, self._head = args.json, rows_of(OUTPUTS)[kind].get("head", "")
+        self.columns = columns_of(kind)
+        self._rows = csv.DictWriter(sys.stdout, self.columns, extrasaction="ignore", lineterminator="\n")
         self._csv, self._begun = args.csv, False
         self.answers: list[dict] = []
 
@@ -147,6 +151,12 @@ class Output:
                 print(self._head)
             print(line, flush=True)
         self._begun |= self._csv or bool(line)
+
+
+def columns_of(kind: str) -> Sequence[str]:
+    """The columns of --csv of a kind of output."""
+    columns: Sequence[str] = rows_of(OUTPUTS)[kind]["columns"]
+    return columns
 
 
 def _cell(value: object) -> object:

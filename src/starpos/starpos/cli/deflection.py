@@ -23,10 +23,6 @@ from starpos.zenith.adjustment import DeflectionSession, FaceQuality, Reduced, r
 from starpos.zenith.doubts import checked_session, remarks
 from starpos.zenith.sighting import ZenithSighting
 
-COLUMNS = ("file", "combined", "status", "utc", "face", "heading", "xi_arcsec", "eta_arcsec", "sigma_xi_arcsec",
-           "sigma_eta_arcsec", "stars_matched", "residual_arcsec", "faces", "frames")  # fmt: skip
-HEAD = "file: face, heading of the frame's top (deg), xi and eta (arcsec) of the frame alone, with the session's A3"
-
 
 def frame_json(path: str, found: DeflectionSession, k: int) -> dict:
     """Frame k of a session, with the deflection that it alone has."""
@@ -198,7 +194,7 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
 
 def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
     """Adjust the session and print it; returns the exit status."""
-    output = console.Output(args, COLUMNS, HEAD)
+    output = console.Output(args, "deflection")
     console.complain(unnamed_inclinometer(taken.instrument))
     rows = list(zip(taken.names, taken.answers, strict=True))
     for name, answer in rows:

@@ -29,15 +29,6 @@ from starpos.units import utc_text
 
 # numbers of an average that are printed
 COUNTS = ("frames", "poses", "left_out", "moved")
-# the first line for people
-HEAD = (
-    "file: latitude and longitude (deg, astronomic: by the plumb line) +- 1 sigma, heading (deg, from true "
-    "north over east) +- 1 sigma"
-)
-# columns of --csv: keys of --json with a single value
-COLUMNS = ("file", "combined", "night", "status", "utc", "latitude", "longitude", "heading", "latitude_geodetic",
-           "longitude_geodetic", "sigma_east_m", "sigma_north_m", "sigma_heading_deg", "stars_detected",
-           "stars_matched", "residual_arcsec", "log_odds", "warnings", "frames")  # fmt: skip
 
 
 def in_degrees(covariance: np.ndarray) -> np.ndarray:
@@ -117,7 +108,6 @@ def line_of(path: str, s: Solution, turning: bool) -> str:
 
 # the status of a row that gives an elevation
 ELEVATION = "elevation alone"
-ELEVATIONS_HEAD = "row: the zenith distance of its direction; together these give the position"
 
 
 def tell_elevations(
@@ -228,14 +218,6 @@ def _lines_of(folder: str | None, together: Average, vertical: Vertical) -> str:
     return "\n".join(lines)
 
 
-# the first line for people
-HEADING_HEAD = (
-    "file: heading (deg, from true north over east) by the plumb line and on WGS 84, pitch (nose up) and roll (left side "
-    "up) by the plumb line, each +- 1 sigma"
-)
-# besides the columns of a fix
-HEADING_COLUMNS = (*COLUMNS, "pitch", "roll", "sigma_pitch_deg", "sigma_roll_deg", "heading_geodetic",
-           "sigma_heading_geodetic_deg", "pitch_geodetic", "roll_geodetic")  # fmt: skip
 # the keys of --json that come from a heading at a known place
 HEADING_KEYS: dict[str, Callable[[Attitude, Attitude], Any]] = {
     "heading": lambda plumb, _: np.degrees(plumb.heading),

@@ -14,21 +14,13 @@ from starpos.frames.frame import Stars
 from starpos.instrument.camera import EQUIDISTANT
 from starpos.units import ARCSEC
 
-# of --csv
-COLUMNS = ("file", "status", "ra", "dec", "roll", "focal_px", "focal_stddev_px", "stars_detected", "stars_matched",
-           "residual_arcsec", "log_odds", "lens", "mirrored", "negative", "warnings", "cpu_ms")  # fmt: skip
-HEAD = (
-    "file: right ascension and declination of the middle of the frame (deg, ICRS), direction of its top (deg, from north "
-    "over east), stars identified of those detected"
-)
-
 
 def run(args: argparse.Namespace) -> int:
     args.frames = inputs.frames_among(args.frames)
     any_found, unreadable = False, False
     lost: Stars | None = None
     complaints = console.FrameComplaints()
-    read, output = inputs.reader_of(args), console.Output(args, COLUMNS, HEAD)
+    read, output = inputs.reader_of(args), console.Output(args, "field")
     solving = inputs.identifying(args, args.frames, read, args.search_time)
     answers = inputs.worked(args, partial(read.on, solving), args.frames)
     for path, answer in zip(args.frames, answers, strict=True):

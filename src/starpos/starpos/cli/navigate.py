@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from starpos.cli import console, inputs, options
-from starpos.cli.fix_output import FIX_KEYS, HEAD
+from starpos.cli.fix_output import FIX_KEYS
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Geodetic, Vertical
 from starpos.errors import FixError, VoyageError
@@ -30,8 +30,6 @@ KEYS: dict[str, Callable[[Any, Geodetic], Any]] = {
     **{key: FIX_KEYS[key] for key in ("latitude_geodetic", "longitude_geodetic", "covariance_geodetic")},
     **{key: FIX_KEYS[key] for key in ("xi_arcsec", "eta_arcsec", "deflection_stddev_arcsec")},
 }
-# of --csv
-COLUMNS = ("file", "status", *(k for k in KEYS if not k.startswith("covariance")))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -70,7 +68,7 @@ def tell(
     args: argparse.Namespace, frames: list[under_way.VoyageFrame], voyage: Voyage, vertical: Vertical
 ) -> int:
     """Write the answer for each frame; returns the exit status."""
-    output = console.Output(args, COLUMNS, HEAD)
+    output = console.Output(args, "voyage")
     console.complain(*voyage.faults)
     for path, frame, fix in zip(args.frames, frames, voyage.fixes, strict=True):
         status = _status(frame, fix)

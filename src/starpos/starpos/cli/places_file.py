@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos import __version__
-from starpos.cli.console import plain
-from starpos.cli.fix_output import COLUMNS
+from starpos.cli.console import columns_of, plain
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.errors import InstrumentError
 from starpos.files import has_mark, save
@@ -65,7 +64,7 @@ def _geojson(found: Sequence[Mapping]) -> dict:
     features = []
     for answer in found:
         latitude, longitude = (answer[name] for name in NUMBERS)
-        about = {k: answer.get(k) for k in COLUMNS if k not in NUMBERS}
+        about = {k: answer.get(k) for k in columns_of("fix") if k not in NUMBERS}
         features.append(("Point", [longitude, latitude], about))
         if answer.get("combined"):
             features.append(("Polygon", [_ellipse(answer)], {"name": "95 %"}))

@@ -18,7 +18,7 @@ from starpos.units import utc_text
 
 def run(args: argparse.Namespace) -> int:
     settings = Settings.of(args.params_file, args.param, args.namespace)
-    output = console.Output(args, fix_output.COLUMNS, fix_output.HEAD)
+    output = console.Output(args, "fix")
     # a wrong parameter is reported once, not for each bag
     Drivers.of(args.params_file, args.param, args.namespace)
     work = Playing(args.params_file, tuple(args.param), args.namespace, remaps_of(args.remap))

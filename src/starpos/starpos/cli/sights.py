@@ -5,7 +5,7 @@ import argparse
 
 from starpos.averaging.sights import circle_of_sight, place_of_sights, read_sights
 from starpos.cli import console, options
-from starpos.cli.fix_output import COLUMNS, ELEVATIONS_HEAD, tell_elevations
+from starpos.cli.fix_output import tell_elevations
 from starpos.cli.inputs import near_of
 from starpos.errors import InstrumentError, StarposError
 from starpos.fix.circle import Circle
@@ -23,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     clock_s = UNKNOWN_CLOCK_S if args.clock_stddev is None else args.clock_stddev
     catalogue, air = load_catalogue(), options.atmosphere_of(args)
     ephemeris = options.ephemeris_of(args)
-    output = console.Output(args, COLUMNS, ELEVATIONS_HEAD)
+    output = console.Output(args, "elevations")
     circles: list[Circle | StarposError] = []
     for sight in sights:
         try:

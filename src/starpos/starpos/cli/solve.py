@@ -196,9 +196,7 @@ def run_pointings(args: argparse.Namespace) -> int:
     check_save(args, solver.instrument)
     tilts = NO_TILTS if own_level else inputs.checked_tilts(args.tilt, solver.instrument)
     whole = [p for p in pointings if p.has_roll]
-    output = console.Output(
-        args, fix_output.COLUMNS, fix_output.HEAD if whole else fix_output.ELEVATIONS_HEAD
-    )
+    output = console.Output(args, "fix" if whole else "elevations")
     if not whole:
         return _from_elevations(args, output, solver, tilts, pointings, vertical, near)
     found, given = None, solver.instrument if not args.self_calibrate else None
@@ -275,14 +273,7 @@ def _run(args: argparse.Namespace) -> int:
         return run_pointings(args)
     vertical = options.vertical_of(args)
     place = options.place_of(args, vertical)
-    output = console.Output(
-        args,
-        *(
-            (fix_output.COLUMNS, fix_output.HEAD)
-            if place is None
-            else (fix_output.HEADING_COLUMNS, fix_output.HEADING_HEAD)
-        ),
-    )
+    output = console.Output(args, "fix" if place is None else "heading")
     inputs.near_of(args)
     own_level = options.has_own_level(args)
     receiver = read_receiver(args.gnss, args.learned)
