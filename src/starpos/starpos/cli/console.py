@@ -38,6 +38,11 @@ def tell(args: argparse.Namespace, value: dict, line: str) -> None:
         print(line, flush=True)
 
 
+def values(of: object, names: str) -> dict:
+    """Attributes of an object by their names, as the object of --json has them too."""
+    return {name: getattr(of, name) for name in names.split()}
+
+
 def plain(value: Any) -> Any:
     """The value of types that json knows, without NaN and infinity."""
     if isinstance(value, dict):

@@ -57,51 +57,38 @@ def frame_line(value: dict) -> str:
 def combined_json(found: DeflectionSession, without: Reduced, mark: Place, station: str) -> dict:
     """The session's value; station: name of the mark, '' for none."""
     sigma_xi, sigma_eta = found.sigma_arcsec
-    return {
-        "combined": True,
-        "status": "ok",
-        "station": station,
-        "site": {
-            "latitude": np.degrees(mark.latitude),
-            "longitude": np.degrees(mark.longitude),
-            "height_m": mark.height_m,
-        },
-        "utc": utc_text(found.mid_unix_s),
-        "duration_s": found.sightings[-1].utc_unix_s - found.sightings[0].utc_unix_s,
-        "xi_arcsec": found.xi_arcsec,
-        "eta_arcsec": found.eta_arcsec,
-        "sigma_xi_arcsec": sigma_xi,
-        "sigma_eta_arcsec": sigma_eta,
-        "covariance_arcsec2": found.covariance_arcsec2,
-        "faces": int(found.faces.max()) + 1,
-        "frames": len(found.sightings),
-        "errors": {name: [xi, eta] for name, xi, eta in found.terms},
-        "correlations": found.correlations,
-        "image_motion_arcsec": found.air.motion / ARCSEC,
-        "anomalous_refraction_arcsec": found.air.anomalous / ARCSEC,
-        "catalogue_factor": found.catalogue_factor,
-        "chi2_per_degree": found.chi2_per_degree,
-        "misalignment_deg": found.misalignment_deg,
-        "reduced": {
-            "tide_arcsec": without.tide_arcsec,
-            "curvature_arcsec": [without.curvature_arcsec, 0.0],
-            "mark_arcsec": without.mark_arcsec,
-            "geoid_arcsec": without.geoid_arcsec,
-        },
-        "by_face": [_face_json(face) for face in found.face_quality],
-        "stars": len(found.stars),
-    }
+    return (
+        {
+            "combined": True,
+            "status": "ok",
+            "station": station,
+            "site": {
+                "latitude": np.degrees(mark.latitude),
+                "longitude": np.degrees(mark.longitude),
+                "height_m": mark.height_m,
+            },
+            "utc": utc_text(found.mid_unix_s),
+            "duration_s": found.sightings[-1].utc_unix_s - found.sightings[0].utc_unix_s,
+            "sigma_xi_arcsec": sigma_xi,
+            "sigma_eta_arcsec": sigma_eta,
+            "faces": int(found.faces.max()) + 1,
+            "frames": len(found.sightings),
+            "errors": {name: [xi, eta] for name, xi, eta in found.terms},
+            "image_motion_arcsec": found.air.motion / ARCSEC,
+            "anomalous_refraction_arcsec": found.air.anomalous / ARCSEC,
+            "reduced": console.values(without, "tide_arcsec mark_arcsec geoid_arcsec")
+            | {"curvature_arcsec": [without.curvature_arcsec, 0.0]},
+            "by_face": [_face_json(face) for face in found.face_quality],
+            "stars": len(found.stars),
+        }
+        | console.values(found, "xi_arcsec eta_arcsec covariance_arcsec2 correlations catalogue_factor")
+        | console.values(found, "chi2_per_degree misalignment_deg")
+    )
 
 
 def _face_json(face: FaceQuality) -> dict:
-    return {
-        "face": face.number + 1,
-        "heading": face.heading_deg,
-        "frames": face.frames,
-        "off_arcsec": face.off_arcsec,
-        "stddev_arcsec": face.stddev_arcsec,
-        "chi2": face.chi2,
-    }
+    about = console.values(face, "frames off_arcsec stddev_arcsec chi2")
+    return {"face": face.number + 1, "heading": face.heading_deg} | about
 
 
 def combined_text(found: DeflectionSession, value: dict) -> str:

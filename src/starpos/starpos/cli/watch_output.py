@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from starpos.cli.console import values
 from starpos.files import save
 from starpos.night.watching import Kept
 from starpos.report.html import document, wide_table
@@ -39,35 +40,27 @@ WIDTH, HEIGHT = 800, 120
 def values_of(night: Kept) -> dict:
     """A night for --json."""
     pose = night.pose
-    return {
-        "night": pose.day,
-        "utc": utc_text(pose.utc_unix_s),
-        "frames": pose.frames,
-        "stars": pose.stars,
-        "moved_arcsec": night.moved_arcsec,
-        "sigma_arcsec": night.sigma_arcsec,
-        "turned_arcsec": (night.turned / ARCSEC).tolist(),
-        "focal_px": pose.focal_px,
-        "limit_mag": pose.limit_mag,
-        "worst_limit_mag": pose.worst_limit_mag,
-        "extinction": pose.extinction,
-        "extinction_sigma": pose.extinction_sigma,
-        "sky_mag": pose.sky_mag,
-        "alarm": night.alarm,
-    }
+    return (
+        {"night": pose.day, "utc": utc_text(pose.utc_unix_s)}
+        | values(pose, "frames stars")
+        | values(night, "moved_arcsec sigma_arcsec")
+        | {"turned_arcsec": night.turned / ARCSEC}
+        | values(pose, "focal_px limit_mag worst_limit_mag extinction extinction_sigma sky_mag")
+        | values(night, "alarm")
+    )
 
 
-def line_of(values: dict) -> str:
+def line_of(night: dict) -> str:
     """Text of a night for people."""
-    sky = "" if math.isnan(values["sky_mag"]) else ", sky V {sky_mag:.2f} per square arcsec"
-    known = not math.isnan(values["extinction"])
+    sky = "" if math.isnan(night["sky_mag"]) else ", sky V {sky_mag:.2f} per square arcsec"
+    known = not math.isnan(night["extinction"])
     air = ", extinction " + (
         "{extinction:.2f} +- {extinction_sigma:.2f} mag per air mass" if known else "unknown"
     )
     return (
         "{night}: {frames} frames, {stars} stars, moved by {moved_arcsec:.1f} +- {sigma_arcsec:.1f} arcsec, focal length "
         "{focal_px:.3f} px, limit V {limit_mag:.1f} (worst frame {worst_limit_mag:.1f})" + air + sky
-    ).format(**values)
+    ).format(**night)
 
 
 def alarm_of(night: Kept) -> str:
