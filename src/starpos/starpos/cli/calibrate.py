@@ -226,7 +226,7 @@ def run(args: argparse.Namespace) -> int:
     overwriting.check(
         args,
         camera=overwriting.camera,
-        map=overwriting.picture,
+        map=overwriting.ours,
         platepar=overwriting.never,
         output=instrument_file.check_replaceable,
     )
@@ -278,7 +278,7 @@ def _watch(args: argparse.Namespace) -> int:
     if args.frames:
         raise FrameError("--watch names the folder of the nights: leave out the frames")
     args.frames = _frames_below(Path(args.watch))
-    overwriting.check(args, page=places_file.check_ours, horizon=overwriting.never)
+    overwriting.check(args, page=overwriting.ours, horizon=overwriting.never)
     site = options.camera_place_of(args)
     answers, stars = [], []
     for item, sight, camera in inputs.seen_at(args, site):

@@ -11,8 +11,7 @@ import numpy as np
 from starpos import __version__
 from starpos.cli.console import columns_of, plain
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.errors import InstrumentError
-from starpos.files import has_mark, save
+from starpos.files import save
 from starpos.report.coast import SIGMAS_95
 
 GPX = ".gpx"
@@ -26,12 +25,6 @@ NUMBERS = ("latitude_geodetic", "longitude_geodetic")
 def is_places(path: str) -> bool:
     """Whether a name has the suffix of such a file."""
     return path.lower().endswith(SUFFIXES)
-
-
-def check_ours(path: Path) -> None:
-    """Raise InstrumentError unless an existing file is one that starpos wrote."""
-    if not has_mark(path):
-        raise InstrumentError(f"{path}: it is there already and not of starpos")
 
 
 def feature_collection(features: Iterable[tuple[str, Sequence, Mapping]]) -> dict:

@@ -10,6 +10,7 @@ from starpos.cli import console, inputs, options, overwriting, places_file
 from starpos.cli.fix_output import json_of
 from starpos.cli.solve import read_receiver
 from starpos.errors import FrameError, InstrumentError
+from starpos.files import save
 from starpos.frames.reading import are_photographs
 from starpos.night.night import Night
 from starpos.night.opening import exposures, frames_in
@@ -21,6 +22,7 @@ from starpos.units import utc_text
 
 # endings of a page in one file
 PAGES = (".html", ".htm")
+INDEX = "index.html"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -37,13 +39,13 @@ def run(args: argparse.Namespace) -> int:
         return _write_places(args)
     if find_spec("matplotlib") is None:
         raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {inputs.PIP}")
-    from starpos.report.html import PAGE, check_folder, write_files
     from starpos.report.page import nights_picture, page, pictures_of
     from starpos.report.photograph import named_photograph
 
     out = Path(args.out)
-    folder, index = (out.parent, out.name) if out.suffix.lower() in PAGES else (out, PAGE)
-    check_folder(folder, index)
+    folder, index = (out.parent, out.name) if out.suffix.lower() in PAGES else (out, INDEX)
+    overwriting.check(argparse.Namespace(out=folder / index), out=overwriting.ours)
+    overwriting.check_folder(folder)
     groups = _groups(args.nights)
     nights = _nights(groups, args)
     bar, each = console.ProgressBar(), []
@@ -60,7 +62,11 @@ def run(args: argparse.Namespace) -> int:
         prefix = f"night{k}-" if len(nights) > 1 else ""
         files |= {f"{prefix}{p.name}.png": p.png for p in pictures}
     # the page has its pictures
-    write_files(folder, ({} if folder != out else files) | {index: html.encode(errors="replace")})
+    files = ({} if folder != out else files) | {index: html.encode(errors="replace")}
+    for name in files:
+        overwriting.check(argparse.Namespace(out=folder / name), out=overwriting.ours)
+    for name, content in files.items():
+        save(folder / name, content, "the report")
     print(folder / index)
     return 0 if any(n.combined for n in nights) else console.NOTHING
 
@@ -82,7 +88,7 @@ def _nights(groups: list[list[Path]], args: argparse.Namespace) -> list[Night]:
 
 def _write_places(args: argparse.Namespace) -> int:
     """Write the places of nights for maps, without a page."""
-    overwriting.check(args, out=places_file.check_ours)
+    overwriting.check(args, out=overwriting.ours)
     answers: list[dict] = []
     for night in _nights(_groups(args.nights), args):
         answers += [{"file": s.name} | json_of(s.place, night.vertical) for _, s in night.fixed]

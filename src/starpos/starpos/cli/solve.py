@@ -268,7 +268,7 @@ def _run(args: argparse.Namespace) -> int:
     options.check_frames(args)
     if args.out is not None and not places_file.is_places(args.out):
         raise InstrumentError(f"-o {args.out}: give a name that ends in {' or '.join(places_file.SUFFIXES)}")
-    overwriting.check(args, save=instrument_file.check_replaceable, out=places_file.check_ours)
+    overwriting.check(args, save=instrument_file.check_replaceable, out=overwriting.ours)
     if args.pointings is not None:
         return run_pointings(args)
     vertical = options.vertical_of(args)
