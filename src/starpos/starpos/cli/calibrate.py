@@ -15,7 +15,7 @@ from starpos import rotation
 from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, hour_by_lens, rms, seen_by
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
-from starpos.cli import console, inputs, options, overwriting, places_file, watch_output
+from starpos.cli import console, inputs, options, overwriting, watch_output
 from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of, stated_site
 from starpos.cli.overwriting import CAMERA_NAME, save_instrument
 from starpos.earth.place import Place
