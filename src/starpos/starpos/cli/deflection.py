@@ -14,10 +14,9 @@ from starpos.errors import FixError, FrameError, InstrumentError, TiltError
 from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.solution import Solution
 from starpos.instrument.instrument import Instrument
-from starpos.night.at_mark import sighted
 from starpos.night.bag import each_frame, is_bag
 from starpos.night.opening import work_of
-from starpos.night.work import Solving
+from starpos.night.work import Solving, zenith_seen
 from starpos.units import ARCSEC, utc_text
 from starpos.zenith.adjustment import DeflectionSession, FaceQuality, Reduced, reduced
 from starpos.zenith.doubts import checked_session, remarks
@@ -148,7 +147,7 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
     instrument = given.instruments.instrument
     assert instrument is not None
     inputs.prepare(instrument, about)
-    work = partial(read.on, partial(sighted, given, mark))
+    work = partial(read.on, partial(zenith_seen, given, mark))
     return _Taken(frames, list(inputs.worked(args, work, frames, lines=False)), instrument)
 
 
@@ -174,7 +173,7 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
     names, answers = [], []
     for name, item in inputs.watched(each_frame(found), found.star_count, lines=False):
         names.append(name)
-        answers.append(item if isinstance(item, FrameError) else sighted(given, mark, item))
+        answers.append(item if isinstance(item, FrameError) else zenith_seen(given, mark, item))
     assert instruments.instrument is not None
     return _Taken(names, answers, instruments.instrument)
 

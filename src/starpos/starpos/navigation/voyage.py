@@ -453,13 +453,6 @@ class Voyage:
     rounds : of the adjustment
     motion, solution : of its last round
     last : where it ends, to be carried on
-
-    Examples
-    --------
-    >>> lists = sorted(Path("drive").glob("stars_*.csv"))
-    >>> voyage = starpos.navigate(lists, "drive/imu.csv", starpos.Instrument(4635.9375), vehicle="rover")
-    >>> len(voyage.fixes) == len(lists)
-    True
     """
 
     fixes: tuple[VoyageFix | None, ...]

@@ -148,13 +148,6 @@ class DeflectionSession:
     likewise, with the air of this adjustment.  gain: twice the log of the likelihood minus the one of same_air.
     chi2_per_degree: of the residuals; 1 where the stated errors and the air's explain them.
     face_quality: each face against the others.  stars (S,): rows of the catalogue.
-
-    Examples
-    --------
-    >>> lists = sorted(Path("zenith").glob("stars_*.csv"))
-    >>> session = starpos.deflection(lists, "zenith/tilt.csv", (61.2, 24.5, 900.0), "zenith/instrument.yaml")
-    >>> len(session.sightings)
-    8
     """
 
     sightings: tuple[ZenithSighting, ...]
