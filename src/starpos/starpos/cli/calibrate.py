@@ -29,7 +29,6 @@ from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame, Stars
 from starpos.frames.reading import why_no_time
 from starpos.frames.tables import TILTS, Pointing, read_pointings
-from starpos.identification import Identification
 from starpos.instrument import instrument_file, platepar
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import up_of
@@ -206,8 +205,6 @@ def _json_of_site(found: Calibrated, path: str) -> dict:
 
 # elevations that scatter by more, in stated sigmas, contradict what is stated with them
 SCATTERED = 3.0
-# the stars of a frame, and their identification
-_Seen = tuple[Stars, Identification | None]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -248,27 +245,28 @@ def run(args: argparse.Namespace) -> int:
         check_output(args, given.instrument)
     sights, unreadable = _sights(args.frames, read, given)
     solver, alike = of_one_camera(Solver(given.instrument, catalogue.load_catalogue()), sights)
-    frames = [(sight.stars, sight.found) for sight in alike]
+    frames = [sight.stars for sight in alike]
+    known = {n: sight.found for n, sight in enumerate(alike) if sight.found is not None}
     instrument = solver.instrument
     if given.sought:
         check_output(args, instrument)
-    tilts = _tilts(args, instrument)
+    tilts = None if args.tilt is None else checked_tilts(args.tilt, instrument).log
     try:
         if args.camera is not None:
-            camera = _camera(args, frames, instrument, tilts)
+            camera = _camera(args, frames, known, instrument, tilts)
             if args.site is None:
                 console.complain("an A3 belongs to the camera it was found with: find it again with this one")
-            frames = [
-                (s, k and k.but(focal_scale=k.focal_scale * instrument.focal_px / camera.fx))
-                for s, k in frames
-            ]
+            known = {
+                n: k.but(focal_scale=k.focal_scale * instrument.focal_px / camera.fx)
+                for n, k in known.items()
+            }
             instrument = replace(instrument, camera=camera, focal_px=camera.fx)
         if args.output is not None:
-            run_site(args, [s for s, _ in frames], instrument, tilts, _known(frames))
+            run_site(args, frames, instrument, tilts, known)
     except (CalibrationError, FixError, PlaceError) as e:
         console.complain(e)
-        if not _known(frames):
-            console.complain(Solving(replace(given, instrument=instrument)).fitting(frames[0][0]))
+        if not known:
+            console.complain(Solving(replace(given, instrument=instrument)).fitting(frames[0]))
         return console.UNREADABLE if unreadable else console.NOTHING
     return console.UNREADABLE if unreadable else 0
 
@@ -339,13 +337,6 @@ def _open_night(args: argparse.Namespace) -> None:
         args.tilt = str(tilts)
 
 
-def _tilts(args: argparse.Namespace, instrument: Instrument) -> TiltLog | None:
-    """The table of --tilt, None without one."""
-    if args.tilt is None:
-        return None
-    return checked_tilts(args.tilt, instrument).log
-
-
 def _from_pointings(args: argparse.Namespace) -> int:
     """Calibrate from the pointings of a plate solver, or from elevations if none has a roll; returns the exit status."""
     pointings = read_pointings(args.pointings)
@@ -355,7 +346,7 @@ def _from_pointings(args: argparse.Namespace) -> int:
         console.complain(f"{len(pointings) - len(whole)} pointings without a roll are left out")
     instrument = options.instrument_of(args, NO_CAMERA)
     check_output(args, instrument)
-    tilts = _tilts(args, instrument)
+    tilts = None if args.tilt is None else checked_tilts(args.tilt, instrument).log
     try:
         if elevations and tilts is not None:
             run_elevations(args, elevations, instrument, tilts)
@@ -383,27 +374,30 @@ def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> tuple[lis
     return sights, unreadable
 
 
-def _known(frames: Sequence[_Seen]) -> dict[int, Identification]:
-    """Identifications of frames, by their numbers."""
-    return {n: found for n, (_, found) in enumerate(frames) if found is not None}
-
-
 def _camera(
-    args: argparse.Namespace, seen: list[_Seen], instrument: Instrument, tilts: TiltLog | None
+    args: argparse.Namespace, frames: list[Stars], known: Known, instrument: Instrument, tilts: TiltLog | None
 ) -> Camera:
     """Fit the camera of --camera, write, draw and print it."""
-    air, (first, _) = options.atmosphere_of(args), seen[0]
+    air, first = options.atmosphere_of(args), frames[0]
     given = instrument.camera_for(first.width, first.height, first.origin_px)
-    if {(f.width, f.height, f.origin_px) for f, _ in seen} != {(given.width, given.height, first.origin_px)}:
+    if {(f.width, f.height, f.origin_px) for f in frames} != {(given.width, given.height, first.origin_px)}:
         raise InstrumentError(
             "the frames differ in size or part of the sensor: give frames of one for --camera"
         )
-    levels: Sequence[np.ndarray | None] = [None] * len(seen)
+    levels: list[np.ndarray | None] = [None] * len(frames)
     if tilts is not None:
-        seen, levels = _levelled(seen, instrument, tilts)
-    frames, bar = [stars for stars, _ in seen], console.ProgressBar()
+        levels = [_level(stars, instrument, tilts) for stars in frames]
+        kept = [n for n, level in enumerate(levels) if level is not None]
+        if not kept:
+            raise CalibrationError(
+                "no frame has a tilt: check that --tilt is of the same night, or leave it out"
+            )
+        known = {k: known[n] for k, n in enumerate(kept) if n in known}
+        frames, levels = [frames[n] for n in kept], [levels[n] for n in kept]
     site = options.camera_place_of(args) if args.site is not None and tilts is None else None
-    found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, bar, _known(seen), site)
+    found = calibrate_camera(
+        frames, levels, given, catalogue.load_catalogue(), air, console.ProgressBar(), known, site
+    )
     for k in sorted(set(range(len(frames))) - set(found.used)):
         console.complain(f"{frames[k].source}: no part of the sky matches it: it is left out")
     if tilts is None and site is None:
@@ -446,25 +440,17 @@ def _write_platepar(
     )
 
 
-def _levelled(
-    frames: Sequence[_Seen], instrument: Instrument, tilts: TiltLog
-) -> tuple[list[_Seen], list[np.ndarray]]:
-    """The frames that have a tilt, with the rotation (3, 3) of C into L for each; complains about the others."""
-    kept: list[_Seen] = []
-    levels: list[np.ndarray] = []
-    for stars, found in frames:
-        try:
-            if stars.mid_unix_s is None:
-                raise FrameError(f"no time of exposure: {why_no_time(stars)}")
-            tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
-            instrument.inclinometer.check_live(tilt)
-            levels.append(instrument.mounting.level(tilt).camera)
-            kept.append((stars, found))
-        except StarposError as e:
-            console.complain(f"{stars.source} is left out: {e}")
-    if not kept:
-        raise CalibrationError("no frame has a tilt: check that --tilt is of the same night, or leave it out")
-    return kept, levels
+def _level(stars: Stars, instrument: Instrument, tilts: TiltLog) -> np.ndarray | None:
+    """The rotation (3, 3) of C into L of a frame; None, after a complaint, if it has no tilt."""
+    try:
+        if stars.mid_unix_s is None:
+            raise FrameError(f"no time of exposure: {why_no_time(stars)}")
+        tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
+        instrument.inclinometer.check_live(tilt)
+        return instrument.mounting.level(tilt).camera
+    except StarposError as e:
+        console.complain(f"{stars.source} is left out: {e}")
+        return None
 
 
 def _tell_what_tilts_would(fit: Intrinsics, air: Atmosphere, frames: Sequence[Stars]) -> None:
