@@ -2,7 +2,6 @@
 """`starpos deflection`: the deflection of the vertical at a known site, from a zenith camera's frames and tilts."""
 
 import argparse
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -122,13 +121,8 @@ def run(args: argparse.Namespace) -> int:
     return _tell(args, _of_bag(args, mark) if _is_bag(args) else _of_files(args, mark), mark)
 
 
-@dataclass(frozen=True, eq=False)
-class _Taken:
-    """A session's frames: their names, and their sightings or the errors."""
-
-    names: list[str]
-    answers: list[ZenithSighting | Solution | FrameError]
-    instrument: Instrument
+# names of a session's frames, their sightings or the errors, and the instrument
+_Taken = tuple[list[str], list[ZenithSighting | Solution | FrameError], Instrument]
 
 
 def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
@@ -148,7 +142,7 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
     assert instrument is not None
     inputs.prepare(instrument, about)
     work = partial(read.on, partial(zenith_seen, given, mark))
-    return _Taken(frames, list(inputs.worked(args, work, frames, lines=False)), instrument)
+    return frames, list(inputs.worked(args, work, frames, lines=False)), instrument
 
 
 def _is_bag(args: argparse.Namespace) -> bool:
@@ -175,25 +169,24 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
         names.append(name)
         answers.append(item if isinstance(item, FrameError) else zenith_seen(given, mark, item))
     assert instruments.instrument is not None
-    return _Taken(names, answers, instruments.instrument)
+    return names, answers, instruments.instrument
 
 
 def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
     """Adjust the session and print it; returns the exit status."""
-    output = console.Output(args, "deflection")
-    console.complain(unnamed_inclinometer(taken.instrument))
-    rows = list(zip(taken.names, taken.answers, strict=True))
+    output, (names, answers, instrument) = console.Output(args, "deflection"), taken
+    console.complain(unnamed_inclinometer(instrument))
+    rows = list(zip(names, answers, strict=True))
     for name, answer in rows:
         if not isinstance(answer, ZenithSighting):
             console.complain(_why(name, answer))
-    sightings = [answer for answer in taken.answers if isinstance(answer, ZenithSighting)]
+    sightings = [answer for answer in answers if isinstance(answer, ZenithSighting)]
     try:
-        session = checked_session(sightings, taken.instrument, options.atmosphere_of(args), mark)
+        session = checked_session(sightings, instrument, options.atmosphere_of(args), mark)
     except FixError as error:
         console.complain(error)
         return console.NOTHING
-    scale = taken.instrument.inclinometer.scale
-    console.complain(*remarks(session, len(rows), scale))
+    console.complain(*remarks(session, len(rows), instrument.inclinometer.scale))
     at = {id(s): k for k, s in enumerate(session.sightings)}
     for name, answer in rows:
         if isinstance(answer, ZenithSighting):
@@ -204,7 +197,7 @@ def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
     without = reduced(session, mark)
     whole = combined_json(session, without, mark, args.station)
     output.put(whole, combined_text(session, whole))
-    return console.UNREADABLE if any(isinstance(a, FrameError) for a in taken.answers) else 0
+    return console.UNREADABLE if any(isinstance(a, FrameError) for a in answers) else 0
 
 
 def _mark_of(args: argparse.Namespace) -> Place:
