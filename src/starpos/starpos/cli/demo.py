@@ -19,7 +19,7 @@ from starpos.units import DAY_S, utc_text
 MAX_LATITUDE_DEG = 45.0
 DRAWN = ("-n", "4", "--size", "2808", "1872")
 # of the drawn instrument
-KNOWN = (
+KNOWN = [
     "--misalignment",
     "0",
     "0",
@@ -28,7 +28,7 @@ KNOWN = (
     "5",
     "--inclinometer",
     "sca100t_calibrated",
-)
+]
 
 
 def run(args: argparse.Namespace) -> int:

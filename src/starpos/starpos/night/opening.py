@@ -198,13 +198,7 @@ def truth_in(folder: Path) -> Truth | None:
 
 @dataclass(frozen=True)
 class NightOnDisk:
-    """A folder of frames with tilt.csv, its instrument and air as far as known; `solve` solves it.
-
-    Attributes
-    ----------
-    instrument : None if the frames' headers have the focal length
-    calibration : A3 in place of the instrument's
-    inclinometer : name of its model in place of the instrument's; '' for the instrument's
+    """A folder of frames with tilt.csv, its instrument and air as far as `open_night` was told; `solve` solves it.
 
     Examples
     --------
