@@ -8,14 +8,14 @@ from pathlib import Path
 
 from starpos.cli import console, inputs, options, overwriting, places_file
 from starpos.cli.fix_output import json_of
-from starpos.cli.solve import read_receiver
+from starpos.cli.solve import how_of
 from starpos.errors import FrameError, InstrumentError
 from starpos.files import save
 from starpos.frames.reading import are_photographs
 from starpos.night.night import Night
 from starpos.night.opening import exposures, frames_in
 from starpos.night.reading import Instruments
-from starpos.night.solving import Exposures, How, solved_night
+from starpos.night.solving import Exposures, solved_night
 from starpos.parameters.given import of_solver
 from starpos.sky import catalogue
 from starpos.units import utc_text
@@ -117,8 +117,7 @@ def _pack(args: argparse.Namespace) -> int:
 
 def _night(paths: list[Path], args: argparse.Namespace) -> Night:
     """The Night of a folder, a bag or photographs; raises StarposError if there is nothing to work on."""
-    receiver = read_receiver(args.gnss, None)
-    how = How(options.turn_of(args) if args.self_calibrate else None, receiver)
+    how = how_of(args)
     return solved_night(_exposures(paths, args), how, console.ProgressBar())
 
 

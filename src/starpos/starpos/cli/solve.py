@@ -39,7 +39,6 @@ from starpos.units import utc_text
 
 if TYPE_CHECKING:
     from starpos.gnss.states import Learned
-    from starpos.night.beside_gnss import Receiver
 
 
 def tell(
@@ -149,18 +148,18 @@ def say(folder: str | None, *texts: object) -> None:
         console.complain(text if folder is None else f"{folder}: {text}")
 
 
-def read_receiver(gnss: str | None, learned: str | None) -> "Receiver | None":
-    """Read the tables of --gnss and --learned; None without the first.  Raises StarposError."""
-    if gnss is None:
-        return None
+def how_of(args: argparse.Namespace) -> How:
+    """How a night is solved, with the tables of --gnss and --learned; raises StarposError."""
+    turn_deg = options.turn_of(args) if args.self_calibrate else None
+    if args.gnss is None:
+        return How(turn_deg)
     from starpos.gnss import states
     from starpos.gnss.receiver import read_gnss_csv
-    from starpos.night.beside_gnss import Receiver
 
-    track, faults = read_gnss_csv(gnss)
+    track, faults = read_gnss_csv(args.gnss)
     console.complain(*faults)
-    before = None if learned is None else states.read_learned(Path(learned))
-    return Receiver(track, before)
+    learned = getattr(args, "learned", None)
+    return How(turn_deg, track, None if learned is None else states.read_learned(Path(learned)))
 
 
 def _save_learned(path: Path, learned: "Learned | None") -> None:
@@ -276,15 +275,14 @@ def _run(args: argparse.Namespace) -> int:
     output = console.Output(args, "fix" if place is None else "heading")
     inputs.near_of(args)
     own_level = options.has_own_level(args)
-    receiver = read_receiver(args.gnss, args.learned)
-    if receiver is not None and own_level:
+    how = how_of(args)
+    if args.gnss is not None and own_level:
         raise InstrumentError(
             "--gnss teaches an inclinometer, and this camera is its own level: leave --gnss out"
         )
-    how = How(options.turn_of(args) if args.self_calibrate else None, receiver)
     # the folder of a night has its tilts
     needs_no_tilt = own_level or (
-        (place is not None or receiver is not None) and not any(map(os.path.isdir, args.frames))
+        (place is not None or args.gnss is not None) and not any(map(os.path.isdir, args.frames))
     )
     given = inputs.nights_of(inputs.frames_among(args.frames, args.tilt, args.gnss), args.tilt, needs_no_tilt)
     if args.save is not None and len(given) > 1:

@@ -17,14 +17,6 @@ from starpos.instrument.tilt_log import Tilts
 
 
 @dataclass(frozen=True)
-class Receiver:
-    """The GNSS places of a night, and what earlier nights learned of the instrument; None where nothing."""
-
-    track: GnssTrack
-    learned: Learned | None = None
-
-
-@dataclass(frozen=True)
 class WatchedNight:
     """The answer to each frame in the given order; what GNSS taught by the end; remarks."""
 
@@ -34,20 +26,25 @@ class WatchedNight:
 
 
 def watched_night(
-    solver: Solver, sights: Sequence[Sight], tilts: Tilts | None, receiver: Receiver, vertical: Vertical
+    solver: Solver,
+    sights: Sequence[Sight],
+    tilts: Tilts | None,
+    track: GnssTrack,
+    before: Learned | None,
+    vertical: Vertical,
 ) -> WatchedNight:
     """Solve a night's frames, which are identified already, in the order of their times.
 
-    tilts: None where headings alone are wanted.
+    tilts: None where headings alone are wanted.  before: what earlier nights learned of the instrument.
     """
-    watch = GnssWatch(solver.instrument, vertical, receiver.learned)
+    watch = GnssWatch(solver.instrument, vertical, before)
     said: Counter[str] = Counter()
     answers: dict[int, Watched] = {}
     for k in sorted(range(len(sights)), key=lambda k: sights[k].stars.mid_unix_s or 0.0):
         stars, rough, gnss = sights[k].stars, sights[k].solution, None
         if stars.mid_unix_s is not None:
             try:
-                gnss = receiver.track.at(stars.mid_unix_s)
+                gnss = track.at(stars.mid_unix_s)
             except GnssError as error:
                 said[str(error)] += 1
         if rough.found is not None and tilts is not None:

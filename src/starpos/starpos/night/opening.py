@@ -249,15 +249,13 @@ class NightOnDisk:
             model, errors = sensors.find(self.inclinometer)
             given = replace(given, inclinometer=errors, inclinometer_model=model)
         instruments = Instruments(given, by_header=self.instrument is None, sought=sought)
-        receiver = None
-        if gnss is not None:
+        if isinstance(gnss, (str, Path)):
             from starpos.gnss.receiver import read_gnss_csv
-            from starpos.night.beside_gnss import Receiver
 
-            receiver = Receiver(read_gnss_csv(gnss)[0] if isinstance(gnss, (str, Path)) else gnss)
+            gnss, _ = read_gnss_csv(gnss)
         return solved_night(
             exposures(self.folder, instruments, self.atmosphere, self.vertical, self.place),
-            How(turn_stddev_deg if self_calibrate else None, receiver),
+            How(turn_stddev_deg if self_calibrate else None, gnss),
             progress,
         )
 

@@ -29,7 +29,9 @@ from starpos.progress import Progress, quiet
 from starpos.rotation import half_turns
 
 if TYPE_CHECKING:
-    from starpos.night.beside_gnss import Receiver, WatchedNight
+    from starpos.gnss.receiver import GnssTrack
+    from starpos.gnss.states import Learned
+    from starpos.night.beside_gnss import WatchedNight
 
 # if readings are further from their median than this, the camera was moved
 STILL_SIGMA = 8.0
@@ -61,16 +63,17 @@ class How:
     """How a night is solved.
 
     turn_stddev_deg: to find A3 by turning, the sigma of its turn about the plumb line; None to use A3 as given.
-    receiver: GNSS, which teaches the instrument; None without one.
+    gnss: places of a receiver, which teach the instrument; learned: what they taught on earlier nights.
     """
 
     turn_stddev_deg: float | None = None
-    receiver: "Receiver | None" = None
+    gnss: "GnssTrack | None" = None
+    learned: "Learned | None" = None
 
     @property
     def one_by_one(self) -> bool:
         """Whether each frame is solved by itself."""
-        return self.turn_stddev_deg is None and self.receiver is None
+        return self.turn_stddev_deg is None and self.gnss is None
 
     def work(self, asked: Solving) -> Solving:
         """The work on one frame: all that is asked, or only to identify it, where all are solved together."""
@@ -112,10 +115,10 @@ def answers_of(
         return NightAnswers(_in_order(rows, ()))
     solver = replace(asked.solver(seen[0].stars), progress=progress)
     solver, alike = of_one_camera(solver, seen)
-    if how.receiver is not None:
+    if how.gnss is not None:
         from starpos.night.beside_gnss import watched_night
 
-        watched = watched_night(solver, alike, asked.tilts, how.receiver, vertical)
+        watched = watched_night(solver, alike, asked.tilts, how.gnss, how.learned, vertical)
         answers = [
             FrameAnswer("", a.solution, s.stars, a) for a, s in zip(watched.answers, alike, strict=True)
         ]
