@@ -35,20 +35,20 @@ KEYS: dict[str, Callable[[Any, Geodetic], Any]] = {
 def run(args: argparse.Namespace) -> int:
     args.frames = inputs.frames_among(args.frames, args.imu, args.velocity)
     vertical, read = options.vertical_of(args), inputs.reader_of(args)
-    records = under_way.Records(
-        imu=args.imu,
-        imu_model=args.imu_model,
-        velocity=args.velocity,
-        vehicle=args.vehicle,
-        mount_stddev_deg=args.mount_stddev,
-        drift_stddev=args.drift_stddev,
-        height_m=args.altitude_m,
-    )
     about = read.first(args.frames)
     if about is None:
         raise VoyageError(f"none of the {len(args.frames)} frames can be read: give star lists or frames")
     instrument, axis = framed(options.instrument_of(args, about), about)
-    vessel, remark = records.vessel(instrument, options.atmosphere_of(args), axis)
+    vessel, remark = under_way.vessel_of(
+        instrument,
+        options.atmosphere_of(args),
+        axis,
+        mount_stddev_deg=args.mount_stddev,
+        height_m=args.altitude_m,
+        imu_model=args.imu_model,
+        vehicle=args.vehicle,
+        drift_stddev=args.drift_stddev,
+    )
     console.complain(remark)
     inputs.prepare(instrument, about)
     given = replace(inputs.given_of(args, about), instrument=instrument)
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     for frame in frames:
         console.complain(frame.message)
     try:
-        voyage = records.voyage(frames, vessel, console.ProgressBar())
+        voyage = under_way.voyage_of(frames, args.imu, args.velocity, vessel, console.ProgressBar())
     except FixError as error:
         console.complain(error)
         return console.NOTHING

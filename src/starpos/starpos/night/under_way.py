@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,57 +49,50 @@ def voyage_frame(given: Instruments, item: Frame | Stars) -> VoyageFrame:
         return VoyageFrame(time_s, None, str(error))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Records:
-    """What a vehicle recorded besides frames: files, and the law by which its speed changes.
+def vessel_of(
+    instrument: Instrument,
+    atmosphere: Atmosphere,
+    axis: AxisDoubt | None = None,
+    *,
+    mount_stddev_deg: float = MOUNT_STDDEV_DEG,
+    height_m: float | None = None,
+    imu_model: str | Path | None = None,
+    **known: Any,
+) -> tuple[Vessel, str]:
+    """The vessel, and a remark if the mount's error includes an unknown axis; InstrumentError if it is too large.
 
-    imu: CSV of angular rates and accelerations.  imu_model: kalibr's YAML; None: a cheap one.
-    velocity: CSV of velocities over ground, along the body's axes; None without one.
-    vehicle: a key of `vessel.LAWS`, or 'parked'; None: anything that moves.
-    mount_stddev_deg: error of the camera's stated orientation on the vehicle.
-    drift_stddev: of current or wind, m/s, where velocities are through water or air.
-    height_m: of the vehicle; None: not known.
+    mount_stddev_deg: error of the camera's stated orientation on the vehicle.  height_m: of it; None: not known.
+    imu_model: kalibr's YAML; None: a cheap one.  known: the vessel's vehicle and drift_stddev.
     """
+    stddev, remark = math.radians(mount_stddev_deg), ""
+    if axis is not None:
+        remark, stddev = axis.counted_as("the mount"), math.hypot(stddev, axis.error_rad)
+        if math.degrees(stddev) > MAX_MOUNT_DEG:
+            raise InstrumentError(f"{remark}; with a mount known no better, there is no position under way")
+    vessel = Vessel(
+        model=ImuModel() if imu_model is None else read_imu_model(Path(imu_model)),
+        camera_to_body=np.asarray(instrument.link_to_camera, float).T,
+        mount_stddev=stddev,
+        atmosphere=atmosphere,
+        clock_stddev_s=instrument.clock_stddev_s,
+        **known,
+    )
+    if height_m is not None:
+        vessel = replace(vessel, height_m=height_m, height_stddev_m=GIVEN_HEIGHT_STDDEV_M)
+    return vessel, remark
 
-    imu: str | Path
-    imu_model: str | Path | None = None
-    velocity: str | Path | None = None
-    vehicle: str | None = None
-    mount_stddev_deg: float = MOUNT_STDDEV_DEG
-    drift_stddev: float = 0.0
-    height_m: float | None = None
 
-    def vessel(
-        self, instrument: Instrument, atmosphere: Atmosphere, axis: AxisDoubt | None = None
-    ) -> tuple[Vessel, str]:
-        """The vessel, and a remark if the mount's error includes an unknown axis; InstrumentError if it is too large."""
-        stddev, remark = math.radians(self.mount_stddev_deg), ""
-        if axis is not None:
-            remark, stddev = axis.counted_as("the mount"), math.hypot(stddev, axis.error_rad)
-            if math.degrees(stddev) > MAX_MOUNT_DEG:
-                raise InstrumentError(
-                    f"{remark}; with a mount known no better, there is no position under way"
-                )
-        vessel = Vessel(
-            vehicle=self.vehicle,
-            model=ImuModel() if self.imu_model is None else read_imu_model(Path(self.imu_model)),
-            camera_to_body=np.asarray(instrument.link_to_camera, float).T,
-            mount_stddev=stddev,
-            atmosphere=atmosphere,
-            clock_stddev_s=instrument.clock_stddev_s,
-            drift_stddev=self.drift_stddev,
-        )
-        if self.height_m is not None:
-            vessel = replace(vessel, height_m=self.height_m, height_stddev_m=GIVEN_HEIGHT_STDDEV_M)
-        return vessel, remark
+def voyage_of(
+    frames: Sequence[VoyageFrame], imu: str, velocity: str | None, vessel: Vessel, progress: Progress = quiet
+) -> Voyage:
+    """The places of the frames, by tables of an IMU and of velocities along the body's axes, if there are any.
 
-    def voyage(self, frames: Sequence[VoyageFrame], vessel: Vessel, progress: Progress = quiet) -> Voyage:
-        """The places of the frames; VoyageError for broken records, FixError where the stars do not support one."""
-        imu = read_imu(str(self.imu))
-        velocity = None if self.velocity is None else read_velocity(str(self.velocity))
-        times = np.array([np.nan if f.utc_unix_s is None else f.utc_unix_s for f in frames])
-        sightings = [f.sighting for f in frames if f.sighting is not None]
-        return adjust_voyage(sightings, imu, velocity, vessel, times, progress)
+    VoyageError for broken records, FixError where the stars do not support a place.
+    """
+    measured = None if velocity is None else read_velocity(velocity)
+    times = np.array([np.nan if f.utc_unix_s is None else f.utc_unix_s for f in frames])
+    sightings = [f.sighting for f in frames if f.sighting is not None]
+    return adjust_voyage(sightings, read_imu(imu), measured, vessel, times, progress)
 
 
 def voyage_frames(answers: Iterable[VoyageFrame | FrameError]) -> list[VoyageFrame]:

@@ -21,7 +21,7 @@ from starpos.gnss.solving import Watched
 from starpos.gnss.watch import GnssStatus
 from starpos.night.night import Night, Truth
 from starpos.parameters.table import rows_of
-from starpos.report import coast, measures, night_figures
+from starpos.report import coast, measures, night_figures, style
 from starpos.report.html import document, figures, sexagesimal, table
 from starpos.report.style import Picture, figures_of
 from starpos.sky.catalogue import Catalogue
@@ -52,8 +52,12 @@ def nights_picture(nights: Sequence[tuple[int, Night]]) -> Picture:
 
 def _picture(name: str, told: object, draw: "Callable[[Figure], None]", simulated: bool) -> Picture:
     texts = rows_of(TEXTS)[name]
-    caption = texts["caption"].format(told=told)
-    return Picture.drawn(name, texts["title"], caption, texts["height"], draw, simulated)
+    caption, figure = texts["caption"].format(told=told), style.new_figure(texts["height"])
+    draw(figure)
+    if simulated:
+        style.mark_simulated(figure)
+        caption = f"Simulated. {caption}"
+    return Picture(name, texts["title"], caption, style.png_of(figure))
 
 
 def _figures(night: Night, catalogue: Catalogue) -> Iterator[_Figure]:
