@@ -49,27 +49,24 @@ from starpos.units import ARCSEC
 def check_site(args: argparse.Namespace) -> None:
     """Raise InstrumentError for options that do not fit together."""
     deflection = (args.xi, args.eta, args.deflection_stddev, args.geoid, args.altitude_m) != (None,) * 5
-    if args.site is None:
-        if deflection:
-            raise InstrumentError("the deflection is for a calibration at a known place: give --site LAT LON")
-        return
     if deflection and not args.geodetic:
         raise InstrumentError(
             "--xi, --eta, --deflection-stddev, --geoid and --altitude-m are of a place on WGS 84: say --geodetic, or "
             "leave them out"
         )
-    if not _camera_alone(args) and (args.output is None or (args.tilt is None and not args.fixed)):
+    if args.site is None:
+        return
+    levelled = args.tilt is not None or args.fixed
+    # without a level and a file of A3, the place gives the camera its level
+    if (args.camera is None or levelled or args.output is not None) and not (
+        args.output is not None and levelled
+    ):
         raise InstrumentError(
             "--site needs the tilts and a file to write: give --tilt CSV and -o INSTRUMENT.yaml (or --fixed in place of "
             "--tilt), or --camera OUT.yaml alone"
         )
     # one sentence for a place that cannot be
     Place.by_gravity(*args.site)
-
-
-def _camera_alone(args: argparse.Namespace) -> bool:
-    """Whether the place only serves the camera: its level without tilts."""
-    return args.camera is not None and args.tilt is None and not args.fixed and args.output is None
 
 
 def check_output(args: argparse.Namespace, instrument: Instrument) -> None:

@@ -161,10 +161,7 @@ def page(
             parts.append(f'<h2 id="night{number}">{number}. {escape(night.name)}</h2>')
         parts += [_place(night), _simulated(night), _summary(night), figures(pictures)]
     parts.append(
-        f"<footer><p>Made by starpos {escape(__version__)} on {escape(made_utc)}, on this machine: nothing left it, and "
-        "the page loads nothing. Positions are astronomic unless said otherwise; errors are 1 sigma. The paper is "
-        "Izadmehr &amp; Khakian Ghomi, &ldquo;Design and construction of a high resolution, portable and low-cost "
-        "positioner by a star tracking system&rdquo;.</p></footer>"
+        f"<footer><p>{rows_of(TEXTS)['footer'].format(version=escape(__version__), made=escape(made_utc))}</p></footer>"
     )
     return document(title, parts)
 
