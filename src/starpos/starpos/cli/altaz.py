@@ -6,7 +6,7 @@ import itertools
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -127,8 +127,6 @@ ALTITUDES, AZIMUTHS, ALONG = (0, 15, 30, 45, 60, 75), range(0, 360, 30), 0.5
 # altitude's stands from the line of the azimuth, deg
 LABEL_PX, LOWEST, OFF_THE_LINES = 20, 5, 3
 NAMES = {0: "N", 90: "E", 180: "S", 270: "W"}
-# frames are enlarged up to this length of the longer side
-SMALLEST_PX = 1000
 # bytes of a PNG up to the end of its first chunk
 PNG_HEADER = 33
 # blue, green, red
@@ -152,7 +150,7 @@ def _figures(seen: _Seen) -> Iterator[np.ndarray]:
                     yield np.degrees(np.stack([azimuth, altitude], -1))
 
 
-def _shade(picture: np.ndarray, seen: _Seen, n: float, ground: np.ndarray) -> None:
+def _shade(picture: np.ndarray, seen: _Seen, n: int, ground: np.ndarray) -> None:
     """Darken the part of a picture (h, w, 3) below a horizon (N, 2) in deg."""
     y, x = np.mgrid[: picture.shape[0], : picture.shape[1]]
     xy = (np.stack([x.ravel(), y.ravel()], -1) + 0.5) * n - 0.5
@@ -160,15 +158,6 @@ def _shade(picture: np.ndarray, seen: _Seen, n: float, ground: np.ndarray) -> No
     edge = np.interp(np.degrees(np.arctan2(v[:, 0], v[:, 1])), ground[:, 0], ground[:, 1], period=360)
     below = (np.degrees(np.arcsin(np.clip(v[:, 2], -1, 1))) < edge).reshape(picture.shape[:2])
     picture[below] = picture[below] // 3
-
-
-def _enlarged(frame: Frame, stars: Stars, n: int) -> tuple[Frame, Stars]:
-    """Enlarge a frame and its stars n times, so that there is room for names and numbers."""
-    x, y = ((v + 0.5) * n - 0.5 for v in (stars.x, stars.y))
-    return (
-        replace(frame, pixels=frame.pixels.repeat(n, 0).repeat(n, 1)),
-        replace(stars, width=n * frame.width, height=n * frame.height, x=x, y=y),
-    )
 
 
 def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None) -> None:
@@ -182,20 +171,17 @@ def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None)
         raise InstrumentError(
             f"{path}: a list of stars has no picture to draw on: give a frame for --overlay"
         )
-    larger = 1 if frame.pattern else max(SMALLEST_PX // max(frame.width, frame.height), 1)
-    frame, stars = _enlarged(frame, stars, larger)
     star, magnitudes = (np.zeros(0) if v is None else v for v in (solution.star, solution.magnitudes))
     named = Identified(star=star.astype(int).tolist(), names=solution.names, magnitudes=magnitudes.tolist())
     picture = annotate(frame, stars, named)
-    # pixels of the frame for one of the picture
-    n = shrink(frame) / larger
+    n = shrink(frame)
 
     def line(directions: np.ndarray) -> np.ndarray:
         """Points (N, 2) of the picture where azimuths and altitudes (N, 2) in deg are."""
         return (seen.pixels(np.radians(directions)) + 0.5) / n - 0.5
 
     if ground is not None:
-        _shade(picture[: int(seen.camera.height / n)], seen, n, ground)
+        _shade(picture[: seen.camera.height // n], seen, n, ground)
     round_, up = np.arange(0, 360 + ALONG, ALONG), np.arange(0, 90, ALONG)
     grid = [(np.stack([round_, np.full_like(round_, a)], -1), GRID) for a in ALTITUDES]
     grid += [(np.stack([np.full_like(up, a), up], -1), GRID) for a in AZIMUTHS]

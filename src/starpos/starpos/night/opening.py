@@ -105,7 +105,7 @@ def work_of(
     tilts: their table, or that photographs have their own; None where none is needed.  Raises TiltError if the table
     cannot be read.
     """
-    known, own = given.instrument, ["", ""]
+    known, said = given.instrument, list[str]()
     by_log = isinstance(tilts, Path) and is_phone_log(tilts) and first.upper_edge is not None
     # a telephone's log has its camera's axes, unless another A3 is stated
     by_log = by_log and (known is None or known.calibration.unknown)
@@ -113,7 +113,7 @@ def work_of(
         model = PHONE if by_log or first.gravity is None else first.gravity.model
         known = None if known is None else known.levelled_by(model)
         if known is not None and (by_log or first.gravity is not None):
-            own[0] = of_gravity(known, by_log)
+            said.append(of_gravity(known, by_log))
     instruments, doubt = replace(given, instrument=known).framed(first)
     level: Tilts | None = None if isinstance(tilts, Path) else tilts
     if isinstance(tilts, ByGravity) and first.gravity is not None:
@@ -122,10 +122,10 @@ def work_of(
         known = instruments.instrument
         errors = sensors.unnamed() if known is None else known.inclinometer
         table = TiltFile(os.path.abspath(tilts), errors.noise_rad)
-        own[1] = of_tilts(table.log, str(tilts), errors)
+        said.append(of_tilts(table.log, str(tilts), errors))
         level = ByGravity(table) if by_log else table
     work = Solving(instruments, atmosphere=atmosphere, tilts=level, places=place)
-    return work, tuple(filter(None, (*own, doubt)))
+    return work, tuple(filter(None, (*said, doubt)))
 
 
 def frames_in(folder: Path) -> list[Path]:
