@@ -52,7 +52,7 @@ def _one_line_each(complain: Callable[[str], None]) -> Callable[..., None]:
 
 
 def parser_for(given: Sequence[str]) -> CommandParser:
-    """The parser of a call; of the options only those of the command in use are read, so that --help is quick."""
+    """The parser of a call; only the options of the command in use are read, so that --help is quick."""
     parser = CommandParser(
         prog="starpos",
         description="Position and heading from the stars.",

@@ -17,7 +17,7 @@ from starpos.night.bag import each_frame, is_bag
 from starpos.night.opening import work_of
 from starpos.night.work import Solving, zenith_seen
 from starpos.units import ARCSEC, utc_text
-from starpos.zenith.adjustment import DeflectionSession, FaceQuality, Reduced, reduced
+from starpos.zenith.adjustment import DeflectionSession, FaceQuality, reduced
 from starpos.zenith.doubts import checked_session, remarks
 from starpos.zenith.sighting import ZenithSighting
 
@@ -52,7 +52,9 @@ def frame_line(value: dict) -> str:
     )
 
 
-def combined_json(found: DeflectionSession, without: Reduced, mark: Place, station: str) -> dict:
+def combined_json(
+    found: DeflectionSession, without: dict[str, np.ndarray], mark: Place, station: str
+) -> dict:
     """The session's value; station: name of the mark, '' for none."""
     sigma_xi, sigma_eta = found.sigma_arcsec
     return (
@@ -74,8 +76,7 @@ def combined_json(found: DeflectionSession, without: Reduced, mark: Place, stati
             "errors": {name: [xi, eta] for name, xi, eta in found.terms},
             "image_motion_arcsec": found.air.motion / ARCSEC,
             "anomalous_refraction_arcsec": found.air.anomalous / ARCSEC,
-            "reduced": console.values(without, "tide_arcsec mark_arcsec geoid_arcsec")
-            | {"curvature_arcsec": [without.curvature_arcsec, 0.0]},
+            "reduced": without,
             "by_face": [_face_json(face) for face in found.face_quality],
             "stars": len(found.stars),
         }
