@@ -49,6 +49,8 @@ from starpos.units import ARCSEC
 def check_site(args: argparse.Namespace) -> None:
     """Raise InstrumentError for options that do not fit together."""
     deflection = (args.xi, args.eta, args.deflection_stddev, args.geoid, args.altitude_m) != (None,) * 5
+    if deflection and args.site is None:
+        raise InstrumentError("the deflection is for a calibration at a known place: give --site LAT LON")
     if deflection and not args.geodetic:
         raise InstrumentError(
             "--xi, --eta, --deflection-stddev, --geoid and --altitude-m are of a place on WGS 84: say --geodetic, or "
