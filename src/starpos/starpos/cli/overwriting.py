@@ -6,6 +6,7 @@ import os
 import re
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from starpos import files
@@ -80,8 +81,10 @@ def ours(path: Path) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Make the folder of a report; WriteError where it could not be written."""
+    """Raise WriteError, before a night is worked on, where its report could not be written; leaves nothing behind."""
+    made: list[Path] = []
     try:
+        made = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -91,6 +94,10 @@ def check_folder(folder: Path) -> None:
         raise WriteError(
             f"{folder}: the report cannot be written there ({reason}): give another --out"
         ) from None
+    finally:
+        for path in made:
+            with suppress(OSError):
+                path.rmdir()
 
 
 def stars(path: Path) -> None:
