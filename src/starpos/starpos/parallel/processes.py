@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Do calls in this process, or in several processes of this machine.
 
-The latter is a ProcessPoolExecutor with three things more: a call whose process dies is done again alone, with all of
-the machine's memory; the processes end with their parent, however it ends; and a terminal's Ctrl-C is the parent's.
+No kept library does the latter. If a process dies, the pools of concurrent.futures and loky break and do not say at
+which call; the processes of concurrent.futures go on after their parent was killed, and where one dies while others
+start, its pool may raise an OSError. Pebble names the call, but its pool breaks if processes die between two calls. And
+none of them does a call again alone, with all of the machine's memory.
 """
 
 import os
@@ -13,12 +15,12 @@ import traceback
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
-from threading import Thread
+from queue import SimpleQueue
+from threading import Lock
 from typing import Any
 
 from starpos.errors import FrameError, StarposError, one_line
@@ -26,11 +28,14 @@ from starpos.parallel import BLAS_THREADS
 
 # Calls for each process whose answers may wait for an earlier one.
 AHEAD = 4
-# There is a process for each processor, so the libraries need no threads of their own. If the parent was killed, Python's
-# tracker removes its semaphores, and need not say so.
-INHERITED = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1") | {
-    "PYTHONWARNINGS": "ignore::UserWarning:multiprocessing.resource_tracker"
-}
+# Maximum number of processes in a row that end before they are ready.
+MAX_STILLBORN = 3
+# Time for a process that no longer answers to end.
+DYING_S = 1.0
+# Exit status of a process that SIGKILL ended; Windows has no signals.
+KILLED_STATUS = -getattr(signal, "SIGKILL", 1 << 16)
+# There is a process for each processor, so the libraries need no threads of their own.
+ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
 
 Files = str | tuple[str, ...]
 # The work and its argument, which can be pickled: a file or files, or anything else.
@@ -104,77 +109,93 @@ def memory_bytes() -> int:
 
 
 class Processes:
-    """A number of processes, started as calls come and ended on leaving.
+    """A number of processes, started on entering and ended on leaving; a thread for each waits for its answers.
 
-    If a process dies, all are started anew, and each call that was under way is done again while no other is.  If its
-    process dies twice then, it is given up.
+    A process that dies is replaced. Its call is done again while no other is, so that it has all of the machine's memory;
+    if its process dies again, it is given up.
     """
 
     def __init__(self, number: int) -> None:
-        self._number = number
+        self._number, self._stillborn = number, 0
+        self._ended, self._how_ended = False, ""
+        # None: there will be no more
+        self._idle: SimpleQueue[_Worker | None] = SimpleQueue()
+        self._workers: list[_Worker] = []
+        self._starting = Lock()
 
     def __enter__(self) -> "Processes":
-        context = get_context("spawn")
-        theirs, self._lifeline = context.Pipe(duplex=False)
-        # Python's tracker of semaphores starts here
-        with _for_one_that_starts():
-            self._pool = ProcessPoolExecutor(self._number, context, _end_with, (theirs,))
-        self._theirs = theirs
+        for _ in range(self._number):
+            self._start()
+        self._threads = ThreadPoolExecutor(self._number)
         return self
 
     def __exit__(self, *_: object) -> None:
-        # ends them, whatever they do
-        self._lifeline.close()
-        self._theirs.close()
-        self._pool.shutdown(cancel_futures=True)
+        self._ended = True
+        self._idle.put(None)
+        with self._starting:
+            for worker in self._workers:
+                worker.kill()
+        self._threads.shutdown(cancel_futures=True)
+        for worker in self._workers:
+            worker.end()
 
-    def _submit(self, work: Callable, *call: Any) -> Future:
-        with _for_one_that_starts():
-            try:
-                return self._pool.submit(work, *call)
-            # one that was idle has died
-            except BrokenProcessPool:
-                self.__exit__()
-                self.__enter__()
-                return self._pool.submit(work, *call)
+    def _start(self) -> None:
+        with self._starting:
+            worker = _Worker()
+            self._workers.append(worker)
+        self._idle.put(worker)
 
     def map(self, calls: Iterable[Call]) -> Iterator:
         """Yield the answers as `Here.map` does."""
         coming = iter(calls)
-        under_way: deque[tuple[Call, Future[_Said] | _Said | None]] = deque()
+        under_way: deque[tuple[Call, Future[_Said | str]]] = deque()
         while True:
             while len(under_way) < AHEAD * self._number and (call := next(coming, None)) is not None:
-                under_way.append((call, self._submit(_heard, *call)))
+                under_way.append((call, self._threads.submit(self._done, call)))
             if not under_way:
                 return
-            if isinstance(future := under_way[0][1], Future) and _died(future):
-                under_way = deque((c, self._alone(c) if _died(f) else f) for c, f in under_way)
-            call, outcome = under_way.popleft()
-            if outcome is None:
-                how = "the process that worked it alone ended twice, perhaps for lack of memory"
+            call, future = under_way.popleft()
+            outcome = future.result()
+            if isinstance(outcome, str):
+                wait(f for _, f in under_way)
+                outcome = self._done(call)
+            if isinstance(outcome, str):
+                how = f"the process that worked it ended twice, the second time alone ({outcome})"
                 yield FrameError(f"{call[1]}: given up: {how}")
                 continue
-            said, answer = outcome.result() if isinstance(outcome, Future) else outcome
+            said, answer = outcome
             for text in said:
                 warnings.warn(text, stacklevel=2)
             yield answer_of(answer)
 
-    def _alone(self, call: Call) -> _Said | None:
-        """What comes of a call while no other is under way; None if its process dies twice."""
-        for _ in range(2):
-            try:
-                self._submit(os.getpid).result()
-            except BrokenProcessPool:
-                raise ProcessError("the processes of --jobs do not start: use fewer, or --jobs 1") from None
-            outcome: Future[_Said] = self._submit(_heard, *call)
-            if not _died(outcome):
-                return outcome.result()
-        return None
+    def _done(self, call: Call) -> "_Said | str":
+        """What a process makes of a call, or in words how the one ended that had begun it.
 
-
-def _died(outcome: Any) -> bool:
-    """Whether a process died before a call was done, which is waited for."""
-    return isinstance(outcome, Future) and isinstance(outcome.exception(), BrokenProcessPool)
+        A process that ends before it has begun the call is replaced: something else ended it, between two calls.
+        """
+        while (worker := self._idle.get()) is not None:
+            outcome = worker.work(call)
+            if outcome is not None:
+                self._stillborn = 0
+                self._idle.put(worker)
+                return outcome
+            if self._ended:
+                break
+            with self._starting:
+                self._workers.remove(worker)
+                self._stillborn += not worker.ready
+            how = worker.end(DYING_S)
+            if self._stillborn > MAX_STILLBORN:
+                self._how_ended = how
+                break
+            self._start()
+            if worker.begun:
+                return how
+        # all other threads end, too
+        self._idle.put(None)
+        raise ProcessError(
+            f"the processes of --jobs do not start ({self._how_ended}): use fewer, or --jobs 1"
+        )
 
 
 # Where calls are done: a context manager that leaves nothing running.
@@ -186,6 +207,53 @@ def workers(number: int) -> Workers:
     return Here() if number <= 1 else Processes(number)
 
 
+class _Worker:
+    """A process.
+
+    begun: whether it has begun the call that it was given last.  ready: whether it has started to work at all.
+    """
+
+    def __init__(self) -> None:
+        self.pipe, theirs = get_context("spawn").Pipe()
+        self.begun = self.ready = False
+        self._process = get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True)
+        with theirs, _for_one_that_starts():
+            self._process.start()
+
+    def work(self, call: Call) -> _Said | None:
+        """What the process says of a call; None if it has died."""
+        self.begun = False
+        message = pickle.dumps(call)
+        try:
+            self.pipe.send_bytes(message)
+            while True:
+                said, outcome = pickle.loads(self.pipe.recv_bytes())
+                if outcome is not None:
+                    return said, outcome
+                # its first word is that it runs, each other one that it has begun
+                self.begun, self.ready = self.ready, True
+        except (EOFError, OSError):
+            return None
+
+    def kill(self) -> None:
+        """Kill the process, which wakes the thread that waits for it."""
+        self._process.kill()
+
+    def end(self, within_s: float = 0.0) -> str:
+        """End the process, killing it after within_s, and return in words how it ended."""
+        self._process.join(within_s)
+        self._process.kill()
+        self._process.join()
+        self.pipe.close()
+        code = self._process.exitcode
+        self._process.close()
+        if code == KILLED_STATUS:
+            return "killed, perhaps for lack of memory: try fewer --jobs"
+        if code is not None and code < 0:
+            return signal.strsignal(-code) or f"signal {-code}"
+        return f"exit status {code}"
+
+
 @contextmanager
 def _for_one_that_starts() -> Iterator[None]:
     """Set what a new process inherits: one thread for each library, and SIGINT blocked.
@@ -193,7 +261,7 @@ def _for_one_that_starts() -> Iterator[None]:
     A terminal sends Ctrl-C to all processes; only the parent is to react.  Windows has no masks of signals.
     """
     before = dict(os.environ)
-    os.environ.update({name: one for name, one in INHERITED.items() if name not in before})
+    os.environ.update({name: one for name, one in ONE_THREAD.items() if name not in before})
     masks = hasattr(signal, "pthread_sigmask")
     if masks:
         # otherwise it starts with the first process, and unblocks SIGINT for it
@@ -204,23 +272,20 @@ def _for_one_that_starts() -> Iterator[None]:
     finally:
         if masks:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for name in INHERITED.keys() - before.keys():
+        for name in ONE_THREAD.keys() - before.keys():
             del os.environ[name]
 
 
-def _end_with(parent: Connection) -> None:
-    """End this process, whatever it does, when its parent closes the pipe or ends."""
-
-    def wait() -> None:
-        with suppress(EOFError, OSError):
-            parent.recv_bytes()
-        os._exit(1)
-
-    Thread(target=wait, daemon=True).start()
-
-
-def _heard(work: Callable, files: Files) -> _Said:
-    """Do the work in a process of its own."""
-    with warnings.catch_warnings(record=True) as said:
-        outcome = worked(work, files)
-    return [str(w.message) for w in said], outcome
+def _serve(pipe: Connection) -> None:
+    """Do the calls that come through the pipe until its other end is closed."""
+    word = pickle.dumps(((), None))
+    with suppress(EOFError, OSError):
+        pipe.send_bytes(word)
+        while True:
+            call = pipe.recv_bytes()
+            # before any work on it, which may end this process
+            pipe.send_bytes(word)
+            work, files = pickle.loads(call)
+            with warnings.catch_warnings(record=True) as said:
+                outcome = worked(work, files)
+            pipe.send_bytes(pickle.dumps(([str(w.message) for w in said], outcome)))

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from starpos.errors import CatalogueError, FrameError
-from starpos.parallel.processes import AHEAD, INHERITED, Here, ProcessError, Processes
+from starpos.parallel.processes import AHEAD, ONE_THREAD, Here, ProcessError, Processes
 
 # the work, which goes to other processes by name
 
@@ -55,7 +55,7 @@ def surroundings(of):
     import cv2
 
     blocked = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    return {name: os.environ[name] for name in INHERITED}, cv2.getNumThreads(), blocked
+    return {name: os.environ[name] for name in ONE_THREAD}, cv2.getNumThreads(), blocked
 
 
 def test_answers_come_in_order_and_no_more_is_asked_for_than_is_worked():
@@ -125,12 +125,12 @@ def test_a_frame_that_ends_every_process_is_given_up_and_the_others_are_not():
         *good, bad, last = workers.map((always_killed, of) for of in ("a", "b", "c", "bad", "d"))
     assert [*good, last] == ["a", "b", "c", "d"]
     assert isinstance(bad, FrameError)
-    assert str(bad).startswith("bad: given up: the process that worked it alone ended twice")
+    assert str(bad).startswith("bad: given up: the process that worked it ended twice")
 
 
 def test_processes_that_do_not_start_end_the_call(monkeypatch):
     monkeypatch.setattr(multiprocessing.spawn, "_python_exe", b"/bin/false")
-    with Processes(2) as workers, pytest.raises(ProcessError, match=r"do not start"):
+    with Processes(2) as workers, pytest.raises(ProcessError, match=r"do not start \(exit status 1\)"):
         list(workers.map((twice, k) for k in range(8)))
 
 
@@ -140,11 +140,11 @@ def test_what_a_process_warns_of_is_heard():
 
 
 def test_a_process_takes_one_processor_and_leaves_ctrl_c_to_its_parent(monkeypatch):
-    for name in INHERITED:
+    for name in ONE_THREAD:
         monkeypatch.delenv(name, raising=False)
     before = dict(os.environ), signal.pthread_sigmask(signal.SIG_BLOCK, ())
     with Processes(1) as workers:
-        assert list(workers.map([(surroundings, 0)])) == [(INHERITED, 1, True)]
+        assert list(workers.map([(surroundings, 0)])) == [(ONE_THREAD, 1, True)]
     assert (dict(os.environ), signal.pthread_sigmask(signal.SIG_BLOCK, ())) == before
 
 
