@@ -29,10 +29,14 @@ from starpos.instrument.instrument import Calibration as Calibration
 from starpos.instrument.instrument import Instrument as Instrument
 from starpos.instrument.tilt_log import TiltLog as TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv as read_tilt_csv
+from starpos.navigation.estimate import VoyageFix as VoyageFix
+from starpos.navigation.voyage import Voyage as Voyage
+from starpos.night.at_mark import deflection as deflection
 from starpos.night.night import Night as Night
 from starpos.night.night import Shot as Shot
 from starpos.night.opening import NightOnDisk as NightOnDisk
 from starpos.night.opening import open_night as open_night
+from starpos.night.under_way import navigate as navigate
 from starpos.night.work import identify as identify
 from starpos.session.replay import PlayedNight as PlayedNight
 from starpos.session.replay import replay as replay
@@ -41,6 +45,7 @@ from starpos.simulation.scene import write_night as write_night
 from starpos.sky.catalogue import Catalogue as Catalogue
 from starpos.sky.catalogue import load_catalogue as load_catalogue
 from starpos.sky.site import Site as Site
+from starpos.zenith.adjustment import DeflectionSession as DeflectionSession
 
 read_instrument = starpos.instrument.instrument_file.read
 write_instrument = starpos.instrument.instrument_file.write

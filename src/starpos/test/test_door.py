@@ -14,6 +14,8 @@ import pytest
 
 import starpos
 from starpos.instrument.sensors import SCA100T_CALIBRATED
+from starpos_testing.skies.folders import write_drive, write_zenith_session
+from starpos_testing.voyages import made
 
 SOURCE = Path(starpos.__file__)
 README = SOURCE.resolve().parents[1] / "README.md"
@@ -86,7 +88,7 @@ def test_the_doors_own_example_is_what_comes_of_it(night, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def workplace(tmp_path_factory):
+def workplace(tmp_path_factory, catalogue):
     """A folder with all files that the examples of the public names read."""
     from starpos.cli import main
 
@@ -98,6 +100,10 @@ def workplace(tmp_path_factory):
     starpos.write_instrument(folder / "instrument.yaml", instrument)
     told = ["--field", str(folder / "night.zip"), "--instrument", str(folder / "instrument.yaml")]
     assert main(["report", str(folder / "night"), *told]) == 0
+    for name in ("drive", "zenith"):
+        (folder / name).mkdir()
+    write_drive(folder / "drive", catalogue, made("rover", 40, 2, cadence_s=4.0))
+    write_zenith_session(folder / "zenith", catalogue)
     rows = "".join(f"{1.8e9 + k},35.7046,51.4106,2.0,2.0\n" for k in range(3))
     (folder / "gnss.csv").write_text("utc_unix_s,latitude,longitude,sigma_east_m,sigma_north_m\n" + rows)
     return folder

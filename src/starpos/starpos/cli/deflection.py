@@ -13,9 +13,10 @@ from starpos.errors import FixError, FrameError, InstrumentError, TiltError
 from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.solution import Solution
 from starpos.instrument.instrument import Instrument
+from starpos.night.at_mark import zenith_seen
 from starpos.night.bag import each_frame, is_bag
 from starpos.night.opening import work_of
-from starpos.night.work import Solving, zenith_seen
+from starpos.night.work import Solving
 from starpos.units import ARCSEC, utc_text
 from starpos.zenith.adjustment import DeflectionSession, FaceQuality, reduced
 from starpos.zenith.doubts import checked_session, remarks

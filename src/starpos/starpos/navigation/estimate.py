@@ -45,6 +45,13 @@ class VoyageFix(PlaceFix):
     velocity, velocity_covariance : (3,) east, north, up, m/s, and (3, 3)
     link : the body's axes, x forward, into east, north, up
     gyro_bias, accel_bias : (3,) rad/s, m/s2
+
+    Examples
+    --------
+    >>> lists = sorted(Path("drive").glob("stars_*.csv"))
+    >>> voyage = starpos.navigate(lists, "drive/imu.csv", starpos.Instrument(4635.9375), vehicle="rover")
+    >>> voyage.fixes[-1].velocity.shape
+    (3,)
     """
 
     velocity: np.ndarray

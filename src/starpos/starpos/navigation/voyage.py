@@ -439,6 +439,13 @@ class Voyage:
     excess, left_out : of frames and velocities, as `Adjustment` has them
     motion : of its last round
     last : where it ends, to be carried on
+
+    Examples
+    --------
+    >>> lists = sorted(Path("drive").glob("stars_*.csv"))
+    >>> voyage = starpos.navigate(lists, "drive/imu.csv", starpos.Instrument(4635.9375), vehicle="rover")
+    >>> len(voyage.fixes) == len(lists)
+    True
     """
 
     fixes: tuple[VoyageFix | None, ...]

@@ -4,22 +4,25 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FixError, FrameError, InstrumentError, TimeError
+from starpos.errors import FixError, FrameError, InstrumentError, TimeError, VoyageError
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame, Stars
-from starpos.instrument.instrument import AxisDoubt, Instrument
+from starpos.instrument import instrument_file
+from starpos.instrument.instrument import AxisDoubt, Instrument, framed
 from starpos.navigation.records import ImuModel, read_imu, read_imu_model, read_velocity
 from starpos.navigation.sightings import PlacelessFrame, sighting_of
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, adjust_voyage
-from starpos.night.reading import Instruments
+from starpos.night.reading import Instruments, Reader
 from starpos.night.work import Solving
+from starpos.parallel.processes import Here
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
 
@@ -98,3 +101,58 @@ def voyage_of(
 def voyage_frames(answers: Iterable[VoyageFrame | FrameError]) -> list[VoyageFrame]:
     """The answers of `voyage_frame`; a frame that cannot be read has only its sentence."""
     return [VoyageFrame(None, None, str(a)) if isinstance(a, FrameError) else a for a in answers]
+
+
+def navigate(
+    frames: Sequence[str | Path],
+    imu: str | Path,
+    instrument: Instrument | str | Path,
+    *,
+    atmosphere: Atmosphere | None = None,
+    velocity: str | Path | None = None,
+    progress: Progress = quiet,
+    **assumed: Any,
+) -> Voyage:
+    """Place, heading and velocity of a moving vehicle at each of its frames.
+
+    Parameters
+    ----------
+    frames : paths of frames or of lists of stars, in the order of their times
+    imu : path of the IMU's CSV: utc_unix_s, gx, gy, gz (rad/s), ax, ay, az (m/s2)
+    instrument : an Instrument, or the path of its file (YAML); its camera is mounted as link_to_camera says
+    atmosphere : of refraction; None: not measured
+    velocity : path of the CSV of measured velocities along the body's axes, m/s; None: none
+    progress : is called with the share of the work that is done
+    **assumed : what else is known, as `vessel_of` takes it: imu_model, vehicle, mount_stddev_deg, drift_stddev, height_m
+
+    Returns
+    -------
+    Voyage
+        `fixes` has a VoyageFix, or None, for each frame: astronomic latitude, longitude and heading in rad, with the
+        covariance (3, 3) of east m, north m, heading rad; velocity (3,) of east, north, up in m/s
+
+    Raises
+    ------
+    VoyageError
+        no frame can be read, or the IMU's record is missing, broken or contradicts the stars
+    FixError
+        the stars do not support a place
+
+    Examples
+    --------
+    >>> lists, camera = sorted(Path("drive").glob("stars_*.csv")), starpos.Instrument(4635.9375)
+    >>> voyage = starpos.navigate(lists, "drive/imu.csv", camera, vehicle="rover", imu_model="drive/imu.yaml")
+    >>> voyage.fixes[-1].covariance.shape  # east m, north m, heading rad
+    (3, 3)
+    """
+    paths, read = tuple(map(str, frames)), Reader()
+    known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
+    about = read.first(paths)
+    if about is None:
+        raise VoyageError(f"none of the {len(paths)} frames can be read: give star lists or frames")
+    whole, axis = framed(known, about)
+    air = Atmosphere.measured(None, None) if atmosphere is None else atmosphere
+    vessel, _ = vessel_of(whole, air, axis, **assumed)
+    work = partial(read.on, partial(voyage_frame, Instruments(whole)))
+    placed = voyage_frames(Here().map((work, path) for path in paths))
+    return voyage_of(placed, str(imu), None if velocity is None else str(velocity), vessel, progress)

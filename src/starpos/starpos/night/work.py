@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starpos.calibration.camera import hour_by_lens, lens_of_frame
-from starpos.earth.place import Place, Places
+from starpos.earth.place import Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, InstrumentError, StarposError
 from starpos.fix import searching
 from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.solution import Solution
-from starpos.fix.solver import Solver, check_explained, placed
+from starpos.fix.solver import Solver, placed
 from starpos.frames.frame import Frame, Stars
 from starpos.frames.reading import read_frame
 from starpos.identification.prior import Hint
@@ -30,7 +30,6 @@ from starpos.sky.bodies import ERFA, SolarSystem
 if TYPE_CHECKING:
     from starpos.detection import Detection
     from starpos.satellites.frames import FrameTrails
-    from starpos.zenith.sighting import ZenithSighting
 
 # Share by which a photograph's focal length may differ from its EXIF's, rounded to 1 mm of a 35 mm film's: 4 % of 13 mm.
 CUT_OUT = 0.06
@@ -262,23 +261,3 @@ def trails_seen(solving: Solving, item: Frame | Stars) -> "tuple[searching.Sight
         return replace(sight, stars=stars, instrument=known), found
     except StarposError as error:
         return Solution.refused(stars, error)
-
-
-def zenith_seen(given: Solving, mark: Place, item: Frame | Stars) -> "ZenithSighting | Solution":
-    """The sighting of a frame at a mark, identified by every way there is, with the instruments, tilts and air given.
-
-    A frame's fault is a Solution that gives the reason.
-    """
-    from starpos.zenith.sighting import sighting
-
-    sight = Solving(given.instruments)(item)
-    instrument = sight.instrument or given.instruments.of(item)
-    if sight.found is None or instrument is None:
-        return sight.solution
-    assert given.tilts is not None
-    solver = Solver(instrument, catalogue.load_catalogue(), given.atmosphere)
-    try:
-        check_explained(sight.solution)
-        return sighting(solver, sight.stars, sight.found, mark, given.tilts)
-    except StarposError as error:
-        return Solution.refused(sight.stars, error)

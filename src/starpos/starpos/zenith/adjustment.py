@@ -97,6 +97,13 @@ class DeflectionSession:
     lines: the equations of the last step, before which the estimate was off the prior's by offset (5,).
     by_second (N, 2): derivatives of the readings by a second of the clock, rad.
     projector (2 N, 2 N), weighted (2 N,): weights that the unknowns leave, and the weighted residuals.
+
+    Examples
+    --------
+    >>> lists = sorted(Path("zenith").glob("stars_*.csv"))
+    >>> session = starpos.deflection(lists, "zenith/tilt.csv", (61.2, 24.5, 900.0), "zenith/instrument.yaml")
+    >>> len(session.sightings)
+    8
     """
 
     sightings: tuple[ZenithSighting, ...]
