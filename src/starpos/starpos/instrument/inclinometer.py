@@ -333,11 +333,3 @@ def level_of(up: np.ndarray) -> np.ndarray:
     cb, sb = np.sqrt(up[1] ** 2 + up[2] ** 2), -up[0]
     sa, ca = up[1] / cb, up[2] / cb
     return np.array([[cb, sa * sb, ca * sb], [0.0, ca, -sa], [-sb, sa * cb, ca * cb]])
-
-
-def levelling_of(a2: np.ndarray) -> np.ndarray:
-    """Matrix (3, 3) from a change of up (3,) in S to a small rotation (3,) of L about its axes; zero about Z.
-
-    a2 (3, 3): S into L.
-    """
-    return np.array([a2[1], -a2[0], np.zeros(3)])

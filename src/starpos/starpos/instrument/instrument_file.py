@@ -41,7 +41,7 @@ def read_camera(path: Path) -> Camera:
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InstrumentError(
             f"{path}: a key of this calibration file is missing or of the wrong kind ({repr(error)[:120]}); "
-            "it needs image_width, image_height, camera_matrix, distortion_coefficients."
+            "it needs image_width, image_height, camera_square, distortion_coefficients."
         ) from None
     model, d = stated_lens(model if isinstance(model, str) else reprlib.repr(model), d, str(path))
     if any(type(side) is not int or side > LARGEST_SIDE for side in (width, height)):
@@ -395,16 +395,12 @@ def _row(mapping: dict, key: str) -> tuple[float, ...]:
     )
 
 
-def _matrix(mapping: dict, key: str) -> tuple:
-    rows = _list(mapping, key, "three rows of three numbers")
-    matrix = tuple(_row({key: row}, key) for row in rows) if len(rows) == 3 else ()
-    if {len(row) for row in matrix} != {3}:
-        raise InstrumentError(f"{key} is {_short(rows)}: give three rows of three numbers")
-    return matrix
-
-
 def _square(mapping: dict, key: str) -> tuple:
-    return tuple(_row({key: row}, key) for row in _list(mapping, key, "rows of numbers"))
+    rows = _list(mapping, key, "rows of numbers")
+    matrix = tuple(_row({key: row}, key) for row in rows)
+    if {len(row) for row in matrix} - {len(rows)}:
+        raise InstrumentError(f"{key} is {_short(rows)}: give as many numbers in each row as there are rows")
+    return matrix
 
 
 def _count(mapping: dict, key: str) -> int:
@@ -424,7 +420,7 @@ def _error(mapping: dict, key: str, unit: float) -> float:
 
 
 # of A3, of how it was found, of the rest, of a shutter, and of a fixed camera's vertical
-CALIBRATION: Schema = {"misalignment_deg": _row, COVARIANCE: _matrix, "remounted_arcsec": _number}
+CALIBRATION: Schema = {"misalignment_deg": _row, COVARIANCE: _square, "remounted_arcsec": _number}
 CALIBRATED: Schema = {
     "temperature_c": _number,
     "tilt_deg": _row,
@@ -433,9 +429,9 @@ CALIBRATED: Schema = {
     "response": _row,
     "response_covariance": _square,
 }
-INSTRUMENT: Schema = {"link_to_camera": _matrix, LINK_STDDEV: _number, "clock_stddev_s": _number}
+INSTRUMENT: Schema = {"link_to_camera": _square, LINK_STDDEV: _number, "clock_stddev_s": _number}
 SHUTTER: Schema = {"readout_s": _number, "readout_stddev_s": _number}
-VERTICAL: Schema = {"camera_to_itrs": _matrix, "covariance_arcsec2": _matrix}
+VERTICAL: Schema = {"camera_to_itrs": _square, "covariance_arcsec2": _square}
 SAG = "sag_arcsec_per_sqrt_hour"
 KEYS = ("camera", *CALIBRATION_KEYS[:4], "remounted_arcsec", *tuple(INSTRUMENT)[:2], "inclinometer", *INCLINOMETER,
         "clock_stddev_s", "shutter", "vertical")  # fmt: skip

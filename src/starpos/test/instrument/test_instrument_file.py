@@ -202,7 +202,7 @@ REFUSED = {
     "a covariance that leans": (COVARIANCE % "[[1, 2, 0], [0, 1, 0], [0, 0, 1]]", "symmetric"),
     "a negative variance": (COVARIANCE % "[[1, 0, 0], [0, -1, 0], [0, 0, 1]]", "negative"),
     "more correlation than there is": (COVARIANCE % "[[1, 2, 0], [2, 1, 0], [0, 0, 1]]", "negative"),
-    "a small covariance": (COVARIANCE % "[[1, 0], [0, 1]]", "three rows of three"),
+    "a small covariance": (COVARIANCE % "[[1, 0], [0, 1]]", "symmetric 3 x 3"),
     "a covariance in a row": (COVARIANCE % "[1, 2, 3]", "give a list of numbers"),
     "a covariance in words": (COVARIANCE % "[[a, 0, 0], [0, 1, 0], [0, 0, 1]]", "is 'a': give a number"),
     "a covariance of nothing": (COVARIANCE % "", "calibration_covariance_arcsec2 is missing"),
