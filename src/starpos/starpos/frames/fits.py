@@ -36,23 +36,12 @@ STEP = 1 << 20
 GZIP_BITS = 31
 
 
-def read_fits(file: BinaryIO, place: str, part: str = "") -> Frame:
-    """Read an open FITS file (also .fz and .gz) by the rules of `reading.read_frame`; FrameError if it holds no frame.
+def read_fits(file: BinaryIO, place: str, part: str = "") -> tuple[Frame, dict[str, Any]]:
+    """Read an open FITS file (also .fz and .gz) by the rules of `reading.read_frame`: the Frame, and its header's KEYS.
 
     place says where it is, for messages; part is the number or the name of the image to take; "": the first one.
+    FrameError if it holds no whole frame.
     """
-    return _read(file, place, part)[0]
-
-
-def decode_fits(data: bytes, source: str) -> tuple[Frame, dict[str, Any]]:
-    """Read the bytes of a FITS file (also .fz): the Frame, and its header's keywords of starpos.frames.header.KEYS.
-
-    source says where the bytes came from. FrameError if they are not a whole frame.
-    """
-    return _read(io.BytesIO(data), source, "")
-
-
-def _read(file: BinaryIO, place: str, part: str) -> tuple[Frame, dict[str, Any]]:
     from astropy.io import fits
 
     try:

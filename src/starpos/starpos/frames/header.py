@@ -6,6 +6,7 @@ middle, end and length are compared, with other cards of UTC and with their comm
 give no time, and a length of 0 is unknown. Without a time `untimed` says why.
 """
 
+import itertools
 import math
 import re
 import warnings
@@ -18,57 +19,15 @@ import erfa
 
 from starpos.errors import FrameError, TimeError, one_line
 from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S, Exposure, Shutter
+from starpos.tables import packaged
 from starpos.units import ARCSEC, DAY_S, UNIX_EPOCH_JD
 
-START, MIDDLE, END = (
-    ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG"),
-    ("DATE-AVG", "MJD-AVG"),
-    ("DATE-END", "MJD-END"),
-)
-# UTC of the start, where DATE-OBS or DATE-BEG is a day alone
-HOURS = (
-    "TIME-OBS",
-    "TIME-BEG",
-    "UT",
-    "UTSTART",
-    "UT-START",
-    "UTCSTART",
-    "UTC",
-    "UTC-OBS",
-    "UT-OBS",
-    "UTSHUT",
-)
-# Other cards with the UTC of some moment of the exposure, which have to agree with those above: dates as text or numbers
-DATES = ("DATE-UTC", "DATE_UTC", "DATE-GPS", "GPS-UTC", "GPS-TIME", "GPSTIME", "JD", "JD-OBS", "OBS-JD", "OBSJD",
-         "JD_UTC", "JD-UTC", "JDSTART", "JUL-DATE", "MJD", "MJD_OBS", "EXPSTART", "UNIXTIME")  # fmt: skip
-# a local time, and its zone: they show whether DATE-OBS is the local one
-LOCAL, ZONES = ("DATE-LOC", "DATE-LT", "LOCTIME", "LOCALTIM"), ("TIMEZONE", "TZ", "TIMEZ")
-# lengths in s: of one exposure (EXP: DWARF), then of all together (LIVETIME: Siril, TOTALEXP: Seestar)
-LENGTHS = ("EXPTIME", "EXPOSURE", "XPOSURE", "EXP", "LIVETIME", "TOTALEXP")
-# number of stacked exposures (Seestar and Siril, IRAF, MaxIm, infrared cameras, Astro Pixel Processor and others)
-COUNTS = ("STACKCNT", "NCOMBINE", "SNAPSHOT", "COADDS", "COADD", "NCOADD", "NCOADDS", "NFRAMES", "NSTACK", "NSTACKED",
-          "LIGH_CNT", "LUM_CNT", "NSUBEXP")  # fmt: skip
-# the second of a stack's inputs (IRAF); the kind of a frame
-SECOND_INPUT, KIND = "IMCMB002", "IMAGETYP"
+# by what they state, as data/cards.csv explains
+CARDS = {row["stated"]: tuple(row["keywords"].split()) for row in packaged("starpos.frames", "cards.csv")}
+KEYS = tuple(itertools.chain.from_iterable(CARDS.values()))
+START, MIDDLE, END = CARDS["start"], CARDS["middle"], CARDS["end"]
+HOURS, DATES, LENGTHS = CARDS["hours"], CARDS["dates"], CARDS["length"]
 STACKED = re.compile(r"\b(master *(light)?|stack(ed)?|integration|co-?add(ed)?|sum(med)?)\b", re.IGNORECASE)
-# when the file was written, some time after the exposure; a local time may seem earlier
-WRITTEN = "DATE"
-TIME_KEYS = (
-    WRITTEN,
-    *START,
-    *MIDDLE,
-    *END,
-    *HOURS,
-    *DATES,
-    *LOCAL,
-    *ZONES,
-    *LENGTHS,
-    *COUNTS,
-    SECOND_INPUT,
-    KIND,
-    "TIMESYS",
-    "TIMEUNIT",
-)
 # Time scales of TIMESYS that are read; UT1 would need tables.
 TIME_SCALES = ("utc", "tai", "tt", "tdb", "gps")
 GPS_BEHIND_TAI_S = 19.0
@@ -105,32 +64,8 @@ CLOCK = re.compile(r"(\d\d?):(\d\d)(?::(\d\d(?:\.\d*)?))?", re.ASCII)
 LEAST_MJD, MOST_MJD, LEAST_JD, LEAST_UNIX_S = 3e4, 1e5, 2.43e6, 9e8
 # smallest step of an MJD's last digit: below it lie the last bits of a double
 MIN_MJD_STEP_S = 1e-3
-# Cards with the column and row of the sensor's frame at which a frame begins, in pixels of this frame, and their sign:
-# positive by SBFITSEXT (MaxIm, APT, Seestar and others), negative in IRAF's physical coordinates
-CROPS = ((("XORGSUBF", "YORGSUBF"), 1.0), (("LTV1", "LTV2"), -1.0))
-# IRAF's size of a pixel in physical ones
-LTM = ("LTM1_1", "LTM2_2")
-# arcsec per px, by INDI, Sequence Generator Pro and others
-PLATE_SCALES = ("SCALE", "PIXSCALE", "SECPIX1")
 # minimum of a focal length, a pixel or a scale that counts as stated
 LEAST = 1e-9
-# latitude and longitude of a site, deg: programs differ in the sign of the longitude
-SITES = (("SITELAT", "SITELONG"), ("LAT-OBS", "LONG-OBS"), ("OBSGEO-B", "OBSGEO-L"))
-# right ascension and declination of a pointing
-AIMS = (("RA", "DEC"), ("OBJCTRA", "OBJCTDEC"), ("TELRA", "TELDEC"))
-KEYS = (
-    *TIME_KEYS,
-    *(key for keys in (*SITES, *AIMS) for key in keys),
-    *(key for keys, _ in CROPS for key in keys),
-    *LTM,
-    *PLATE_SCALES,
-    "BAYERPAT",
-    "XBAYROFF",
-    "YBAYROFF",
-    "FOCALLEN",
-    "XPIXSZ",
-    "ROLLSHUT",
-)
 
 
 def read_exposure(header: Mapping, place: str, comments: Mapping[str, str] = NO_COMMENTS) -> Exposure:
@@ -155,7 +90,7 @@ def aim_deg(header: Mapping) -> tuple[float, float] | None:
 
     A number is in deg, a text with colons or blanks in h m s and in deg ' ".
     """
-    for keys in AIMS:
+    for keys in zip(CARDS["right_ascension"], CARDS["declination"], strict=True):
         right, up = (_sexagesimal(header.get(key)) for key in keys)
         if right is not None and up is not None:
             (ra, in_hours), (dec, _) = right, up
@@ -179,7 +114,7 @@ def _sexagesimal(value: Any) -> tuple[float, bool] | None:
 
 def site_cards(header: Mapping) -> str:
     """The cards with which a header states a site, for messages; '' without any."""
-    for keys in SITES:
+    for keys in zip(CARDS["latitude"], CARDS["longitude"], strict=True):
         if all(header.get(key) not in (None, "") for key in keys):
             return " and ".join(f"{key} {one_line(header[key])}" for key in keys)
     return ""
@@ -187,11 +122,12 @@ def site_cards(header: Mapping) -> str:
 
 def origin_px(header: Mapping) -> tuple[float, float] | None:
     """Column and row of the sensor's frame at which a frame begins; None if nothing says so, NaN for no numbers."""
-    for keys, sign in CROPS:
+    for begins, sign in (("", 1.0), ("minus_", -1.0)):
+        keys = CARDS[f"{begins}left"] + CARDS[f"{begins}top"]
         if any(header.get(key) not in (None, "") for key in keys):
             with suppress(TypeError, ValueError, OverflowError):
                 left, top = (sign * float(header.get(key) or 0) for key in keys)
-                scales = [float(header.get(key) or 1) for key in LTM if sign < 0]
+                scales = [float(header.get(key) or 1) for key in CARDS["minus_scale"] if sign < 0]
                 if math.isfinite(left) and math.isfinite(top) and all(scale == 1 for scale in scales):
                     return left + 0.0, top + 0.0
             return math.nan, math.nan
@@ -223,7 +159,7 @@ def focal_px(header: Mapping) -> float | None:
     focal, pixel_um = _positive(header, "FOCALLEN"), _positive(header, "XPIXSZ")
     if focal is not None and pixel_um is not None:
         return focal * 1000.0 / pixel_um
-    scales = (_positive(header, key) for key in PLATE_SCALES)
+    scales = (_positive(header, key) for key in CARDS["plate_scale"])
     return next((1.0 / (scale * ARCSEC) for scale in scales if scale is not None), None)
 
 
@@ -400,13 +336,13 @@ def _other_unix_s(header: Mapping, key: str, near_unix_s: float) -> tuple[float,
 
 def _check_zone(header: Mapping, mid_unix_s: float, exposure_s: float) -> None:
     """TimeError if the time of the exposure may be the local one of the header's zone."""
-    zone = next((key for key in ZONES if header.get(key) not in (None, "")), None)
+    zone = next((key for key in CARDS["zone"] if header.get(key) not in (None, "")), None)
     offset_h = None if zone is None else _offset_h(header[zone])
     if not offset_h:
         return
     if any(_other_unix_s(header, key, mid_unix_s) is not None for key in (*HOURS, *DATES)):
         return
-    for key in LOCAL:
+    for key in CARDS["local"]:
         if (local := _other_unix_s(header, key, mid_unix_s)) is not None:
             if abs(local[0] - mid_unix_s) > exposure_s + FOUND_S:
                 return
@@ -422,7 +358,7 @@ def _check_zone(header: Mapping, mid_unix_s: float, exposure_s: float) -> None:
 
 def _check_written(header: Mapping, mid_unix_s: float) -> None:
     """TimeError if the file was written more than a day before the exposure."""
-    written = _other_unix_s(header, WRITTEN, mid_unix_s)
+    written = _other_unix_s(header, "DATE", mid_unix_s)
     if written is not None and mid_unix_s - written[0] > DAY_S:
         days = (mid_unix_s - written[0]) / DAY_S
         raise TimeError(
@@ -453,15 +389,15 @@ def _apart_s(one: _Middle, other: _Middle) -> float:
 
 def _check_single(header: Mapping) -> None:
     """Raise TimeError for a stack: it shows the sky of one of its exposures, which need not be the middle one."""
-    for key in COUNTS:
+    for key in CARDS["count"]:
         count = header.get(key)
         if isinstance(count, (int, float)) and count > 1:
             raise TimeError(
                 f"it is a stack of {count:g} exposures ({key}), whose light has no one time: give single exposures"
             )
-    kind = str(header.get(KIND) or "")
-    if header.get(SECOND_INPUT) not in (None, "") or STACKED.search(kind):
-        by = KIND if STACKED.search(kind) else SECOND_INPUT
+    named = STACKED.search(str(header.get("IMAGETYP") or ""))
+    if named or header.get("IMCMB002") not in (None, ""):
+        by = "IMAGETYP" if named else "IMCMB002"
         raise TimeError(
             f"it is a stack of exposures ({by}), whose light has no one time: give single exposures"
         )

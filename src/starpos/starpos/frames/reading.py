@@ -93,7 +93,7 @@ def _part_of(path: Path) -> tuple[Path, str]:
 def _read(file: BinaryIO, place: str, suffix: str, part: str, clock: CameraClock | None) -> Frame | Stars:
     """Read an open file as files with this suffix are read."""
     if suffix in FITS:
-        return in_order(read_fits(file, place, part))
+        return in_order(read_fits(file, place, part)[0])
     if suffix == ".csv":
         return read_star_list(file, place)
     for suffixes, decode in ((PICTURE + JPEG, picture_frame), (HEIF, heif_frame), (RAW, raw_frame)):
