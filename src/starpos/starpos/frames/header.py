@@ -178,23 +178,13 @@ def focal_mm(focal_px: float, pixel_um: float) -> float:
 
 
 @dataclass(frozen=True)
-class _Instant:
-    """A time of a card: Julian date in TAI in two parts, and its standard deviation (s) by its last digit."""
+class _Moment:
+    """A moment by some cards: s in TAI since 1970, and its standard deviation by its last digit.
 
-    day: float
-    part: float
-    stddev_s: float
+    As differences are formed in TAI, exposures across a leap second come out right.
+    """
 
-    def since_s(self, other: "_Instant") -> float:
-        """Time in s from another instant to this one."""
-        return ((self.day - other.day) + (self.part - other.part)) * DAY_S
-
-
-@dataclass(frozen=True)
-class _Middle:
-    """The middle of the exposure, s after an instant, by some cards."""
-
-    after_s: float
+    tai_s: float
     stddev_s: float
     by: str
 
@@ -207,31 +197,27 @@ def read_times(header: Mapping, comments: Mapping[str, str] = NO_COMMENTS) -> Ex
     stamp_stddev_s comes from the last digit of a time, which may be rounded or cut off, and from how far cards that
     should agree are apart. A header without any card of a time has an empty untimed.
     """
+    exposure_s = None
     try:
         _check_single(header)
         lengths = _lengths(header, comments)
-    except TimeError as e:
-        return Exposure(untimed=str(e))
-    exposure_s = next(iter(lengths.values()), None)
-    try:
+        exposure_s = next(iter(lengths.values()), None)
         header = _as_commented(header, comments)
-        instants = _instants(header)
-        middles, zero = _middles(instants, lengths)
-    except TimeError as e:
-        return Exposure(exposure_s=exposure_s, untimed=str(e))
-    if zero is None or not middles:
-        return Exposure(exposure_s=exposure_s, untimed="" if zero is None else _no_length(header))
-    best = min(middles, key=lambda m: m.stddev_s)
-    other = max(middles, key=lambda m: _apart_s(m, best))
-    if (apart_s := _apart_s(other, best)) > MAX_APART_S:
-        return Exposure(
-            untimed=f"the middle of its exposure by {best.by} and by {other.by} differ by "
-            f"{abs(other.after_s - best.after_s):.3g} s: these cards contradict each other, correct the header"
-        )
-    if exposure_s is None:
-        exposure_s = _span_s(instants)
-    mid_unix_s = _unix_s(zero.day, zero.part + best.after_s / DAY_S)
-    try:
+        moments = _moments(header)
+        middles = _middles(moments, lengths)
+        if not middles:
+            return Exposure(exposure_s=exposure_s, untimed=_no_length(header) if moments else "")
+        best = min(middles, key=lambda m: m.stddev_s)
+        other = max(middles, key=lambda m: _apart_s(m, best))
+        if (apart_s := _apart_s(other, best)) > MAX_APART_S:
+            exposure_s = None
+            raise TimeError(
+                f"the middle of its exposure by {best.by} and by {other.by} differ by "
+                f"{abs(other.tai_s - best.tai_s):.3g} s: these cards contradict each other, correct the header"
+            )
+        if exposure_s is None:
+            exposure_s = _span_s(moments)
+        mid_unix_s = _unix_s(best.tai_s)
         off_s = _off_others_s(header, mid_unix_s, exposure_s or 0.0)
         _check_zone(header, mid_unix_s, exposure_s or 0.0)
         _check_written(header, mid_unix_s)
@@ -310,10 +296,7 @@ def _other_unix_s(header: Mapping, key: str, near_unix_s: float) -> tuple[float,
         return None
     try:
         if isinstance(value, str) and (text := _as_today(value)) and ISO_TIME.fullmatch(text):
-            with warnings.catch_warnings():
-                # of years whose leap seconds are not known yet
-                warnings.simplefilter("ignore", erfa.ErfaWarning)
-                return _unix_s(*_tai(*_day_of(text, "utc"), "utc")), math.sqrt(3) * _rounding(text)
+            return _unix_s(_tai_s(text, "utc")), math.sqrt(3) * _rounding(text)
         if isinstance(value, str) and (clock := CLOCK.fullmatch(value.strip())):
             hours, minutes, seconds = clock.groups()
             of_day_s = int(hours) * 3600 + int(minutes) * 60 + float(seconds or 0)
@@ -321,7 +304,7 @@ def _other_unix_s(header: Mapping, key: str, near_unix_s: float) -> tuple[float,
             later_s = math.remainder(of_day_s - near_unix_s, DAY_S)
             return near_unix_s + later_s, step_s
         number = float(value)
-    except (TypeError, ValueError, OverflowError, erfa.ErfaError):
+    except (TypeError, ValueError, OverflowError):
         return None
     # a Unix time, a Julian date or an MJD, by its size
     if key not in DATES or key.startswith("GPS") or not math.isfinite(number):
@@ -380,11 +363,11 @@ def _offset_h(value: Any) -> float | None:
     return -hours if found[1] == "-" else hours
 
 
-def _apart_s(one: _Middle, other: _Middle) -> float:
+def _apart_s(one: _Moment, other: _Moment) -> float:
     """How much farther two middles are apart than rounding of their digits explains."""
     step_s = math.sqrt(3) * (one.stddev_s + other.stddev_s)
     # and the last bits of sums
-    return max(0.0, abs(one.after_s - other.after_s) - step_s - 1e-6)
+    return max(0.0, abs(one.tai_s - other.tai_s) - step_s - 1e-6)
 
 
 def _check_single(header: Mapping) -> None:
@@ -432,63 +415,52 @@ def _no_length(header: Mapping) -> str:
     return "how long it was exposed is unknown: its header needs EXPTIME"
 
 
-def _instants(header: Mapping) -> dict[str, _Instant]:
+def _moments(header: Mapping) -> dict[str, _Moment]:
     """The times in the header by card; TimeError for a value that is not a time."""
     keys = [key for key in (*START, *MIDDLE, *END) if header.get(key) not in (None, "")]
     scale = str(header.get("TIMESYS") or "UTC").strip().lower()
     if keys and scale not in TIME_SCALES:
         raise TimeError(f"its TIMESYS is {scale[:20]!r}: it must be one of {', '.join(TIME_SCALES)}")
-    instants = {key: _instant(header, key, scale) for key in keys}
-    return {key: instant for key, instant in instants.items() if instant is not None}
+    moments = {key: _moment(header, key, scale) for key in keys}
+    return {key: moment for key, moment in moments.items() if moment is not None}
 
 
-def _middles(
-    instants: Mapping[str, _Instant], lengths: Mapping[str, float]
-) -> tuple[list[_Middle], _Instant | None]:
-    """The middles of the exposure by the cards, and the instant they count from; TimeError if they end early."""
-    if not instants:
-        return [], None
-    zero = next(iter(instants.values()))
+def _middles(moments: Mapping[str, _Moment], lengths: Mapping[str, float]) -> list[_Moment]:
+    """The middles of the exposure by the cards; TimeError if they end early."""
     starts, middles, ends = (
-        {key: instants[key] for key in keys if key in instants} for keys in (START, MIDDLE, END)
+        [moments[key] for key in keys if key in moments] for keys in (START, MIDDLE, END)
     )
-    by_cards = [_Middle(m.since_s(zero), m.stddev_s, key) for key, m in middles.items()]
-    for key, start in starts.items():
-        at_s = start.since_s(zero)
-        by_cards += [
-            _Middle(at_s + s / 2, start.stddev_s, f"{key} with {length}") for length, s in lengths.items()
+    for start in starts:
+        middles += [
+            _Moment(start.tai_s + s / 2, start.stddev_s, f"{start.by} with {key}")
+            for key, s in lengths.items()
         ]
-        for last, end in ends.items():
-            span_s = end.since_s(start)
-            if span_s < 0:
-                raise TimeError(f"its {last} is before its {key}: correct the header")
+        for end in ends:
+            if end.tai_s < start.tai_s:
+                raise TimeError(f"its {end.by} is before its {start.by}: correct the header")
             # an end is often the arrival of the frame: a start and a length are better
             stddev_s = math.hypot(start.stddev_s, end.stddev_s)
-            by_cards.append(_Middle(at_s + span_s / 2, stddev_s, f"{key} with {last}"))
+            middles.append(_Moment((start.tai_s + end.tai_s) / 2, stddev_s, f"{start.by} with {end.by}"))
     if not starts:
         # a clock read on arrival of the frame is late
-        by_cards += [
-            _Middle(
-                end.since_s(zero) - s / 2,
-                math.hypot(end.stddev_s, UNKNOWN_LATENCY_S),
-                f"{last} with {length}",
-            )
-            for last, end in ends.items()
-            for length, s in lengths.items()
+        middles += [
+            _Moment(end.tai_s - s / 2, math.hypot(end.stddev_s, UNKNOWN_LATENCY_S), f"{end.by} with {key}")
+            for end in ends
+            for key, s in lengths.items()
         ]
-    return by_cards, zero
+    return middles
 
 
-def _span_s(instants: Mapping[str, _Instant]) -> float | None:
+def _span_s(moments: Mapping[str, _Moment]) -> float | None:
     """The length of the exposure from its start to its end, as far as these are known."""
-    start, end = (next((instants[key] for key in keys if key in instants), None) for keys in (START, END))
+    start, end = (next((moments[key] for key in keys if key in moments), None) for keys in (START, END))
     if start is None or end is None:
         return None
-    span_s = end.since_s(start)
+    span_s = end.tai_s - start.tai_s
     return span_s if 0 < span_s <= MAX_EXPOSURE_S else None
 
 
-def _instant(header: Mapping, key: str, scale: str) -> _Instant | None:
+def _moment(header: Mapping, key: str, scale: str) -> _Moment | None:
     """The time of a card; None if it is a day without an hour. TimeError if it is not a time."""
     value = header[key]
     if key.startswith("MJD"):
@@ -513,25 +485,20 @@ def _instant(header: Mapping, key: str, scale: str) -> _Instant | None:
             # a card of the hours may repeat the day
             value = _as_today(hours) if str(_as_today(hours)).startswith(f"{value}T") else f"{value}T{hours}"
     try:
-        with warnings.catch_warnings():
-            # of years whose leap seconds are not known yet
-            warnings.simplefilter("ignore", erfa.ErfaWarning)
-            # a second beyond the end of its minute
-            warnings.filterwarnings("error", ".*(after end of day|both of)", erfa.ErfaWarning)
-            day, part = _tai(*_day_of(value, scale), scale)
-    except (erfa.ErfaError, erfa.ErfaWarning, ValueError, TypeError, OverflowError):
+        return _Moment(_tai_s(value, scale), _rounding(value), key)
+    except (ValueError, TypeError, OverflowError):
         raise TimeError(
             f"its {key} is {one_line(repr(value))}, which is no time of an exposure (hours to 23, minutes and seconds to "
             "59): write it like 2026-11-02T18:00:00.000"
         ) from None
-    return _Instant(day, part, _rounding(value))
 
 
-def _unix_s(day: float, part: float) -> float:
-    """Unix time of a Julian date in TAI; as sums are formed in TAI, exposures across a leap second come out right."""
+def _unix_s(tai_s: float) -> float:
+    """Unix time of a number of seconds in TAI since 1970."""
+    days, rest_s = divmod(tai_s, DAY_S)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)
-        day, part = erfa.taiutc(day, part)
+        day, part = erfa.taiutc(UNIX_EPOCH_JD + days, rest_s / DAY_S)
     return float((day - UNIX_EPOCH_JD) * DAY_S + part * DAY_S)
 
 
@@ -556,32 +523,39 @@ def _rounding(start: float | str) -> float:
     return 10.0 ** -len(decimals[1] or "") / math.sqrt(3)
 
 
-def _day_of(start: float | str, scale: str) -> tuple[float, float]:
-    """Julian date of a time in its scale, in two parts: ERFA's quasi-JD for UTC; ValueError if invalid.
+def _tai_s(start: float | str, scale: str) -> float:
+    """Seconds in TAI since 1970 of a text or an MJD in its scale; ValueError if it is no time.
 
     By ERFA alone: astropy's times, which are ERFA's, take as long to import as the rest of a program's start.
     """
-    if not isinstance(start, str):
-        if not abs(start) < FARTHEST_MJD:
-            raise ValueError(start)
-        return MJD_ZERO_JD, start
-    found = ISO_TIME.fullmatch(start.strip())
-    if found is None:
-        raise ValueError(start)
-    *whole, seconds = found.groups()
-    # GPS time has no leap seconds, like TAI
-    return tuple(erfa.dtf2d("UTC" if scale == "utc" else "TAI", *map(int, whole), float(seconds or 0)))
-
-
-def _tai(day: float, part: float, scale: str) -> tuple[float, float]:
-    """The Julian date in TAI of one in another scale, each in two parts."""
-    if scale == "tai":
-        return day, part
-    if scale == "utc":
-        return tuple(erfa.utctai(day, part))
-    if scale == "gps":
-        return day, part + GPS_BEHIND_TAI_S / DAY_S
-    if scale == "tdb":
-        # at the geocentre; the time of day has no part in it there
-        day, part = erfa.tdbtt(day, part, erfa.dtdb(day, part, 0.0, 0.0, 0.0, 0.0))
-    return tuple(erfa.tttai(day, part))
+    try:
+        with warnings.catch_warnings():
+            # of years whose leap seconds are not known yet
+            warnings.simplefilter("ignore", erfa.ErfaWarning)
+            # a second beyond the end of its minute
+            warnings.filterwarnings("error", ".*(after end of day|both of)", erfa.ErfaWarning)
+            if isinstance(start, str):
+                found = ISO_TIME.fullmatch(start.strip())
+                if found is None:
+                    raise ValueError(start)
+                *whole, seconds = found.groups()
+                # GPS time has no leap seconds, like TAI
+                day, part = erfa.dtf2d(
+                    "UTC" if scale == "utc" else "TAI", *map(int, whole), float(seconds or 0)
+                )
+            elif abs(start) < FARTHEST_MJD:
+                day, part = MJD_ZERO_JD, start
+            else:
+                raise ValueError(start)
+            if scale == "utc":
+                day, part = erfa.utctai(day, part)
+            if scale == "gps":
+                part += GPS_BEHIND_TAI_S / DAY_S
+            if scale == "tdb":
+                # at the geocentre; the time of day has no part in it there
+                day, part = erfa.tdbtt(day, part, erfa.dtdb(day, part, 0.0, 0.0, 0.0, 0.0))
+            if scale in ("tdb", "tt"):
+                day, part = erfa.tttai(day, part)
+    except (erfa.ErfaError, erfa.ErfaWarning) as e:
+        raise ValueError(start) from e
+    return float((day - UNIX_EPOCH_JD) * DAY_S + part * DAY_S)
