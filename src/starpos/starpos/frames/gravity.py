@@ -279,7 +279,7 @@ def read_gravity(data: bytes, width: int, height: int) -> Gravity:
     facts = _Facts.of(data)
     facts.check_unedited()
     try:
-        found = _by_gimbal(data) or _by_note(facts.block, facts.order, facts.first, facts.tags)
+        found = _by_gimbal(data) or _by_note(facts)
     except (struct.error, TypeError, ValueError, IndexError):
         raise FrameError("its maker's note is damaged or cut off") from None
     if found is None:
@@ -302,8 +302,8 @@ def _by_gimbal(data: bytes) -> Gravity | None:
     return Gravity.of_level(angles[b"Roll"], angles[b"Pitch"], 0.1) if len(angles) == 2 else None
 
 
-def _by_note(block: bytes, order: str, first: dict, tags: dict) -> Gravity | None:
-    note = bytes(tags.get(NOTE, ()))
+def _by_note(facts: _Facts) -> Gravity | None:
+    block, order, note = facts.block, facts.order, bytes(facts.tags.get(NOTE, ()))
     for start, order_at, directory, own, read in NOTES:
         if note.startswith(start):
             if order_at is not None:
@@ -313,7 +313,7 @@ def _by_note(block: bytes, order: str, first: dict, tags: dict) -> Gravity | Non
             return read(
                 _Note(note, order, directory) if own else _Note(block, order, block.find(note) + directory)
             )
-    if note and _text(first.get(MAKE)).startswith("Canon"):
+    if note and _text(facts.first.get(MAKE)).startswith("Canon"):
         # a program that turns EXIF's byte order leaves the note's; a note has less than 256 tags
         return _canon(_Note(block, "<" if note[1] == 0 else ">", block.find(note)))
     return None

@@ -10,7 +10,7 @@ import itertools
 import math
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -85,6 +85,11 @@ def read_exposure(header: Mapping, place: str, comments: Mapping[str, str] = NO_
     )
 
 
+def _stated(header: Mapping, keys: Iterable[str]) -> list[str]:
+    """Those of the cards that a header has, with a value."""
+    return [key for key in keys if header.get(key) not in (None, "")]
+
+
 def aim_deg(header: Mapping) -> tuple[float, float] | None:
     """Right ascension and declination (deg) to which a header says that the telescope was pointed; None without.
 
@@ -115,7 +120,7 @@ def _sexagesimal(value: Any) -> tuple[float, bool] | None:
 def site_cards(header: Mapping) -> str:
     """The cards with which a header states a site, for messages; '' without any."""
     for keys in zip(CARDS["latitude"], CARDS["longitude"], strict=True):
-        if all(header.get(key) not in (None, "") for key in keys):
+        if len(_stated(header, keys)) == 2:
             return " and ".join(f"{key} {one_line(header[key])}" for key in keys)
     return ""
 
@@ -124,7 +129,7 @@ def origin_px(header: Mapping) -> tuple[float, float] | None:
     """Column and row of the sensor's frame at which a frame begins; None if nothing says so, NaN for no numbers."""
     for begins, sign in (("", 1.0), ("minus_", -1.0)):
         keys = CARDS[f"{begins}left"] + CARDS[f"{begins}top"]
-        if any(header.get(key) not in (None, "") for key in keys):
+        if _stated(header, keys):
             with suppress(TypeError, ValueError, OverflowError):
                 left, top = (sign * float(header.get(key) or 0) for key in keys)
                 scales = [float(header.get(key) or 1) for key in CARDS["minus_scale"] if sign < 0]
@@ -231,10 +236,8 @@ def read_times(header: Mapping, comments: Mapping[str, str] = NO_COMMENTS) -> Ex
 def _as_commented(header: Mapping, comments: Mapping[str, str]) -> Mapping:
     """The header with its start as the comment calls it: the middle or the end; TimeError for a time that is not UTC."""
     values = dict(header)
-    for key in START:
+    for key in _stated(header, START):
         comment = comments.get(key, "")
-        if not comment or values.get(key) in (None, ""):
-            continue
         local = OFFSET.search(comment) or ZONE.search(comment) or LOCALLY.search(comment)
         if local and not UNIVERSAL.search(comment):
             raise TimeError(
@@ -319,8 +322,8 @@ def _other_unix_s(header: Mapping, key: str, near_unix_s: float) -> tuple[float,
 
 def _check_zone(header: Mapping, mid_unix_s: float, exposure_s: float) -> None:
     """TimeError if the time of the exposure may be the local one of the header's zone."""
-    zone = next((key for key in CARDS["zone"] if header.get(key) not in (None, "")), None)
-    offset_h = None if zone is None else _offset_h(header[zone])
+    zone = next(iter(_stated(header, CARDS["zone"])), "")
+    offset_h = _offset_h(header.get(zone))
     if not offset_h:
         return
     if any(_other_unix_s(header, key, mid_unix_s) is not None for key in (*HOURS, *DATES)):
@@ -390,9 +393,8 @@ def _lengths(header: Mapping, comments: Mapping[str, str]) -> dict[str, float]:
     """The lengths of the exposure in s by card; 0 is missing. TimeError for a value that is not a length."""
     lengths = {}
     general = str(header.get("TIMEUNIT") or "s").strip().lower()
-    for key in LENGTHS:
-        if (value := header.get(key)) in (None, ""):
-            continue
+    for key in _stated(header, LENGTHS):
+        value = header[key]
         named = re.search(r"\[ *(\w+) *\]", comments.get(key, ""))
         unit_s = UNITS_S.get(named[1].lower() if named else general)
         try:
@@ -409,15 +411,14 @@ def _lengths(header: Mapping, comments: Mapping[str, str]) -> dict[str, float]:
 
 
 def _no_length(header: Mapping) -> str:
-    zero = [key for key in LENGTHS if header.get(key) not in (None, "")]
-    if zero:
+    if zero := _stated(header, LENGTHS):
         return f"how long it was exposed is unknown, its {zero[0]} is 0: correct the header"
     return "how long it was exposed is unknown: its header needs EXPTIME"
 
 
 def _moments(header: Mapping) -> dict[str, _Moment]:
     """The times in the header by card; TimeError for a value that is not a time."""
-    keys = [key for key in (*START, *MIDDLE, *END) if header.get(key) not in (None, "")]
+    keys = _stated(header, (*START, *MIDDLE, *END))
     scale = str(header.get("TIMESYS") or "UTC").strip().lower()
     if keys and scale not in TIME_SCALES:
         raise TimeError(f"its TIMESYS is {scale[:20]!r}: it must be one of {', '.join(TIME_SCALES)}")
@@ -478,12 +479,12 @@ def _moment(header: Mapping, key: str, scale: str) -> _Moment | None:
                 f"its {key} is {value!r}, which is no text: write it like 2026-11-02T18:00:00.000"
             )
         if DAY.fullmatch(value):
-            hours = next((header[k] for k in HOURS if header.get(k) not in (None, "")), None)
-            if hours is None or key in (*MIDDLE, *END):
+            hours = _stated(header, HOURS)
+            if not hours or key in (*MIDDLE, *END):
                 return None
-            hours = str(hours).strip()
             # a card of the hours may repeat the day
-            value = _as_today(hours) if str(_as_today(hours)).startswith(f"{value}T") else f"{value}T{hours}"
+            hour = _as_today(str(header[hours[0]]))
+            value = hour if hour.startswith(f"{value}T") else f"{value}T{hour}"
     try:
         return _Moment(_tai_s(value, scale), _rounding(value), key)
     except (ValueError, TypeError, OverflowError):
