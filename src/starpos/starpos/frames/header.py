@@ -86,7 +86,7 @@ def read_exposure(header: Mapping, place: str, comments: Mapping[str, str] = NO_
 
 
 def _stated(header: Mapping, keys: Iterable[str]) -> list[str]:
-    """Those of the cards that a header has, with a value."""
+    """Choose the cards that a header has with a value, from some."""
     return [key for key in keys if header.get(key) not in (None, "")]
 
 
