@@ -313,5 +313,5 @@ class Stars(Exposure):
 
 def no_stars(width: int, height: int, **about: Any) -> Stars:
     """The Stars of a frame without stars; `about` are fields of the Exposure."""
-    columns = {name: np.zeros((0, 2, 2) if name == "covariance" else 0) for name in COLUMNS}
+    columns: dict[str, Any] = {name: np.zeros((0, 2, 2) if name == "covariance" else 0) for name in COLUMNS}
     return Stars(**columns, width=width, height=height, **about)
