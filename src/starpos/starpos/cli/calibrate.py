@@ -431,8 +431,10 @@ def _write_platepar(
             "of one pose"
         )
     times = [frames[k].mid_unix_s or 0.0 for k in found.used]
-    seen = seen_by(camera, mean, site, air, times[len(times) // 2])
-    plate, worst = platepar.platepar_of(camera, seen)
+    middle_s = times[len(times) // 2]
+    place = site.latitude, site.longitude, 0.0 if np.isnan(site.height_m) else site.height_m
+    seen = seen_by(camera, mean, site, air, middle_s)
+    plate, worst = platepar.platepar_of(camera, *seen, middle_s, place)
     save(path, (json.dumps(plate, indent=4, sort_keys=True) + "\n").encode(), "the platepar")
     console.complain(
         f"{path}: RMS sees stars within {worst:.2f} px of this camera; the platepar has no photometry"

@@ -14,10 +14,6 @@ from starpos.units import ARCSEC, HOUR_S
 
 # The -D01 variant.
 SCA100T_RANGE_RAD = np.radians(30.0)
-# Output at zero tilt with a 5 V supply (paper, section 3.1)
-SCA100T_OFFSET_V = 2.5
-# The -D01 variant.
-SCA100T_SENSITIVITY_V_PER_G = 4.0
 # Noise of one 10 Hz sample, 1 sigma: the paper's resolution.
 SCA100T_NOISE_RAD = np.radians(0.0035)
 

@@ -115,7 +115,7 @@ REFUSED = {
         "starpos_instrument: 1\ncamera: {calibration: instrument.yaml}\n",
         "image_width",
     ),
-    "nan": (SIMPLE + "misalignment_deg: [.nan, 0, 0]\n", "finite"),
+    "nan": (SIMPLE + "misalignment_deg: [.nan, 0, 0]\n", "within 360 deg"),
     "infinite size": (FULL.replace("1392", ".inf"), "width"),
     "fraction of a pixel": (FULL.replace("1392", "1392.5"), "width"),
     "infinite noise": (SIMPLE + "tilt_noise_deg: .inf\n", "tilt_noise_deg is inf: give a finite number"),
@@ -214,7 +214,7 @@ REFUSED = {
         COVARIANCE % "[[1e308, 1e308, 0], [1e308, 1e308, 0], [0, 0, 1]]",
         "beyond any turn",
     ),
-    "an infinite covariance": (COVARIANCE % "[[1e400, 0, 0], [0, 1, 0], [0, 0, 1]]", "finite"),
+    "an infinite covariance": (COVARIANCE % "[[1e400, 0, 0], [0, 1, 0], [0, 0, 1]]", "beyond any turn"),
     "a turn below zero": (SIMPLE + "remounted_arcsec: -1\n", "give 0 to"),
     "an error beyond floats": (SIMPLE + "calibration_stddev_arcsec: [1e200, 1, 1]\n", "at most"),
     "both": (
@@ -236,7 +236,7 @@ REFUSED = {
     "valid for no time": (DATED % "valid_days: 0", "valid_days is 0.0: must be positive"),
     "valid for nobody knows how long": (DATED % "valid_days: .nan", "valid_days is nan"),
     "valid for words": (DATED % "valid_days: soon", "valid_days is 'soon': give a number"),
-    "four tilts": (DATED % "tilt_deg: [1, 2, 3, 4]", "tilt_deg of a calibration two or three"),
+    "four tilts": (DATED % "tilt_deg: [1, 2, 3, 4]", "two or three axes"),
     "one tilt": (DATED % "tilt_deg: 5", "tilt_deg is 5: give a list"),
     "a tilt beyond range": (DATED % "tilt_deg: [80, 80]", "is impossible: give the elevations"),
     "as hot as a star": (DATED % "temperature_c: 6000", "temperature_c of the calibration is 6000"),
@@ -250,7 +250,7 @@ REFUSED = {
     ),
     "a scale of two": (SIMPLE + "tilt_scale: 2\n", "tilt_scale is 2: give a finite number from 0 to 1"),
     "a temperature's words": (SIMPLE + "tilt_temperature_arcsec_per_c: warm\n", "is 'warm': give a number"),
-    "many turns": (SIMPLE + "misalignment_deg: [1e300, 0, 0]\n", "beyond 360 deg"),
+    "many turns": (SIMPLE + "misalignment_deg: [1e300, 0, 0]\n", "within 360 deg"),
     "a link beyond floats": (SIMPLE + "link_to_camera: [[1e300, 0, 0], [0, 1, 0], [0, 0, 1]]\n", "rotation"),
 }
 
