@@ -60,12 +60,13 @@ def vessel_of(
     mount_stddev_deg: float = MOUNT_STDDEV_DEG,
     height_m: float | None = None,
     imu_model: str | Path | None = None,
-    **known: Any,
+    vehicle: str | None = None,
+    drift_stddev: float = 0.0,
 ) -> tuple[Vessel, str]:
     """The vessel, and a remark if the mount's error includes an unknown axis; InstrumentError if it is too large.
 
     mount_stddev_deg: error of the camera's stated orientation on the vehicle.  height_m: of it; None: not known.
-    imu_model: kalibr's YAML; None: a cheap one.  known: the vessel's vehicle and drift_stddev.
+    imu_model: kalibr's YAML; None: a cheap one.  vehicle, drift_stddev: as of `Vessel`.
     """
     stddev, remark = math.radians(mount_stddev_deg), ""
     if axis is not None:
@@ -78,7 +79,8 @@ def vessel_of(
         mount_stddev=stddev,
         atmosphere=atmosphere,
         clock_stddev_s=instrument.clock_stddev_s,
-        **known,
+        vehicle=vehicle,
+        drift_stddev=drift_stddev,
     )
     if height_m is not None:
         vessel = replace(vessel, height_m=height_m, height_stddev_m=GIVEN_HEIGHT_STDDEV_M)
