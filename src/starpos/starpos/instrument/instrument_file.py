@@ -35,7 +35,7 @@ def read_camera(path: Path) -> Camera:
     try:
         model = content.get("distortion_model", "plumb_bob")
         width, height = content["image_width"], content["image_height"]
-        k = _ros_numbers(content["camera_matrix"], 9)
+        k = tuple(float(value) for value in content["camera_matrix"]["data"])
         terms = content.get("distortion_coefficients")
         d = () if terms is None else tuple(float(value) for value in terms["data"])
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
@@ -46,7 +46,7 @@ def read_camera(path: Path) -> Camera:
     model, d = stated_lens(model if isinstance(model, str) else reprlib.repr(model), d, str(path))
     if any(type(side) is not int or side > LARGEST_SIDE for side in (width, height)):
         raise InstrumentError(f"{path}: image_width and image_height must be whole numbers of px.")
-    if any(k[i] for i in (1, 3, 6, 7)) or k[8] != 1:
+    if len(k) != 9 or any(k[i] for i in (1, 3, 6, 7)) or k[8] != 1:
         raise InstrumentError(
             f"{path}: camera_matrix is not [fx 0 cx, 0 fy cy, 0 0 1]; calibrate without skew."
         )
@@ -57,13 +57,6 @@ def read_camera(path: Path) -> Camera:
         )
     except InstrumentError as error:
         raise InstrumentError(f"{path}: {error}") from None
-
-
-def _ros_numbers(matrix: dict, count: int) -> tuple[float, ...]:
-    values = tuple(float(value) for value in matrix["data"])
-    if len(values) != count:
-        raise ValueError(f"{len(values)} values for {count}")
-    return values
 
 
 def write_camera(path: Path, camera: Camera, name: str, comment: str = "") -> None:
@@ -160,7 +153,7 @@ def read(path: Path | str, needs_camera: bool = True) -> Instrument:
         )
     try:
         return _from_mapping(content, path.parent, needs_camera)
-    except InstrumentError as e:
+    except (InstrumentError, FrameError) as e:
         raise InstrumentError(f"{path}: {e}") from None
 
 
@@ -246,10 +239,7 @@ def _from_mapping(content: dict, folder: Path, needs_camera: bool) -> Instrument
     sensor, errors = _sensor(content, bool(given))
     more = _told(content, INSTRUMENT)
     if "shutter" in content:
-        try:
-            more["shutter"] = Shutter(**_told(_mapping(content, "shutter", SHUTTER), SHUTTER, needed=True))
-        except FrameError as e:
-            raise InstrumentError(str(e)) from None
+        more["shutter"] = Shutter(**_told(_mapping(content, "shutter", SHUTTER), SHUTTER, needed=True))
     instrument = Instrument(
         **optics,
         calibration=_calibration(content),
