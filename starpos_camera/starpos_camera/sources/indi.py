@@ -3,6 +3,7 @@
 
 import base64
 import binascii
+import io
 import select
 import socket
 import threading
@@ -14,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from starpos.errors import one_line
-from starpos.frames.fits import decode_fits
+from starpos.frames.fits import read_fits
 from starpos.frames.frame import MAX_PIXELS
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource
 from starpos_camera.sources.timing import clock_stddev_of, dated_by_driver
@@ -396,7 +397,7 @@ class Indi(DeviceSource[IndiDevice]):
         commanded_s = self._now()
         blob = expose(device, exposure_s, self._values["indi.readout"])
         ready_s = self._now()
-        frame, header = decode_fits(_fits_of(blob), "its frame")
+        frame, header = read_fits(io.BytesIO(_fits_of(blob)), "its frame")
         if frame.untimed:
             raise CaptureError(f"the header of its frame cannot be used: {frame.untimed}.")
         told, clock_s = str(header.get("DATE-OBS", "")), clock_stddev_of("indi", self._host, self._values)

@@ -47,7 +47,7 @@ def read_geotiff(data: bytes, most_bytes: int) -> tuple[np.ndarray, float, float
     if _number(tags, SAMPLES, 1) != 1:
         raise GeoidError(f"it has {_number(tags, SAMPLES, 1)} bands: one, of undulations, is wanted")
     south, west, step_latitude, step_longitude = _corner(tags, height)
-    scale, offset = _metadata(tags)
+    _check_metadata(tags)
     values = decode_picture(data)
     if values is None or values.shape != (height, width):
         raise GeoidError("its pixels cannot be decoded: copy it again")
@@ -56,8 +56,6 @@ def read_geotiff(data: bytes, most_bytes: int) -> tuple[np.ndarray, float, float
     nodata = _nodata(tags)
     if nodata is not None:
         values[values == values.dtype.type(nodata)] = np.nan
-    if (scale, offset) != (1.0, 0.0):
-        values = values * values.dtype.type(scale) + values.dtype.type(offset)
     return values.astype(np.float32, copy=False)[::-1], south, west, step_latitude, step_longitude
 
 
@@ -102,8 +100,8 @@ def _corner(tags: dict, height: int) -> tuple[float, float, float, float]:
     return north - (height - 1 + centre - row) * scale[1], west, scale[1], scale[0]
 
 
-def _metadata(tags: dict) -> tuple[float, float]:
-    """Scale and offset of the values; GeoidError if the metadata say that they are not undulations."""
+def _check_metadata(tags: dict) -> None:
+    """GeoidError if the metadata say that the values are not undulations in m."""
     text = _text(tags, GDAL_METADATA)
     items = dict(re.findall(r'<Item name="(\w+)"[^>]*>([^<]*)</Item>', text))
     kind = items.get("TYPE", "VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL")
@@ -112,13 +110,10 @@ def _metadata(tags: dict) -> tuple[float, float]:
     # of the same type are heights of a tidal surface (hydroid_height), which is not level
     if (band := items.get("DESCRIPTION", UNDULATION).strip()) != UNDULATION:
         raise GeoidError(f"its band is {band[:60]!r}: one of {UNDULATION} is wanted")
-    try:
-        scale, offset = float(items.get("SCALE", 1)), float(items.get("OFFSET", 0))
-    except ValueError:
-        raise GeoidError("the SCALE or OFFSET in its metadata is no number") from None
-    if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
-        raise GeoidError(f"its metadata claim a scale of {scale:g} and an offset of {offset:g}")
-    return scale, offset
+    if items.get("SCALE", "1") != "1" or items.get("OFFSET", "0") != "0":
+        raise GeoidError(
+            "its values have a SCALE or an OFFSET: gdal_translate -unscale -ot Float32 applies them"
+        )
 
 
 def _nodata(tags: dict) -> float | None:

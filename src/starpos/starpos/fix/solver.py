@@ -234,7 +234,7 @@ class Solver:
             fix_s=time.perf_counter() - done,
             extrapolated_days=state.orientation.extrapolated_days,
             hint=Hint.at(found, state, camera.fx * found.focal_scale, fix.latitude, fix.longitude),
-            named=answer.named.of_rows(fix.used),
+            named=sky.catalogue.named(found.catalogue[fix.used]),
             star=found.star[fix.used],
         )
 

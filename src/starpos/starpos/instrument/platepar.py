@@ -164,31 +164,19 @@ def _undistorted(plate: Mapping[str, Any], xy: np.ndarray) -> tuple[float, np.nd
     return 1.0, np.stack([x + dx, y + dy], -1)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SkyPixels:
-    """What pixels of a camera at a place show at a time.
-
-    xy (N, 2) in px, icrs (N, 3): where, without aberration and refraction, the light at each pixel comes from.
-    latitude, longitude in rad on WGS 84; height_m: above the sea.
-    """
-
-    xy: np.ndarray
-    icrs: np.ndarray
-    utc_unix_s: float
-    latitude: float
-    longitude: float
-    height_m: float
-
-
-def platepar_of(camera: Camera, seen: SkyPixels) -> tuple[dict[str, Any], float]:
+def platepar_of(
+    camera: Camera, xy: np.ndarray, icrs: np.ndarray, utc_unix_s: float, place: tuple[float, float, float]
+) -> tuple[dict[str, Any], float]:
     """The content of a platepar, and by how many px at most RMS then sees a direction elsewhere than the camera.
 
+    xy (N, 2) in px, icrs (N, 3): where, without aberration and refraction, the light at each pixel comes from.
+    place: latitude, longitude in rad on WGS 84, and height above the sea in m.
     Its photometry is not calibrated: RMS's defaults.  InstrumentError for a camera that looks at a celestial pole.
     """
-    jd = UNIX_EPOCH_JD + seen.utc_unix_s / DAY_S
-    site = seen.latitude, seen.longitude
-    rays = camera.directions(*seen.xy.T)
-    apparent = _refracted(seen.icrs, jd, *site)
+    jd = UNIX_EPOCH_JD + utc_unix_s / DAY_S
+    *site, height_m = place
+    rays = camera.directions(*xy.T)
+    apparent = _refracted(icrs, jd, *site)
     to_sky = rotation.best_rotation(rays, apparent)
     ra, dec = erfa.c2s(to_sky[:, 2])
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
@@ -198,9 +186,9 @@ def platepar_of(camera: Camera, seen: SkyPixels) -> tuple[dict[str, Any], float]
     plate = _lens_terms(camera) | {
         "version": 2,
         "station_code": "XX0001",
-        "lat": float(np.degrees(seen.latitude)),
-        "lon": float(np.degrees(seen.longitude)),
-        "elev": float(seen.height_m),
+        "lat": float(np.degrees(site[0])),
+        "lon": float(np.degrees(site[1])),
+        "elev": float(height_m),
         "JD": jd,
         "Ho": float(np.degrees(_sidereal(jd))),
         "UT_corr": 0,
@@ -221,7 +209,7 @@ def platepar_of(camera: Camera, seen: SkyPixels) -> tuple[dict[str, Any], float]
     east, north, up = _horizon(jd, *site) @ _precession(erfa.DJ00, jd) @ rotation.unit_vector(*pointing[:2])
     plate["az_centre"] = float(np.degrees(np.arctan2(east, north)) % 360)
     plate["alt_centre"] = float(np.degrees(_raised(np.arcsin(up))))
-    off = _distorted(plate, apparent @ to_sky) - seen.xy
+    off = _distorted(plate, apparent @ to_sky) - xy
     return plate, float(np.hypot(*off.T).max())
 
 

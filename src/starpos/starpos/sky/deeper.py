@@ -47,11 +47,8 @@ def _densities(catalogue: Catalogue) -> tuple[float, float, float]:
 
 def _solid_angle_deg2(camera: Camera) -> float:
     """Solid angle of a pinhole's frame."""
-    width, height = camera.width / camera.fx, camera.height / camera.fy
-    u, v = (np.arange(-20, 21) / 20 * n / 2 for n in (width, height))
-    # a pixel's solid angle falls with the cube of the cosine
-    share = np.mean((1 + u[:, None] ** 2 + v**2) ** -1.5)
-    return float(width * height * share * np.degrees(1) ** 2)
+    u, v = camera.width / camera.fx / 2, camera.height / camera.fy / 2
+    return 4 * math.atan(u * v / math.sqrt(1 + u**2 + v**2)) * math.degrees(1) ** 2
 
 
 # The number of Tycho-2's stars.
