@@ -58,7 +58,7 @@ READS_WHOLE = {
     "starpos/report/coast.py": "of the package",
     "starpos/night/field.py": "MAX_BYTES",
     "starpos/recording/bag.py": "installed messages; MAX_METADATA",
-    "starpos/instrument/sensors.py": "of the package",
+    "starpos/cli/__init__.py": "of the package: the list of commands",
     "starpos/tables.py": "most_bytes of each form",
     "starpos/frames/tables.py": "MAX_CSV_BYTES",
     "starpos/parameters/table.py": "of the package",

@@ -17,18 +17,23 @@ import threading
 import weakref
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
-from tornado.http1connection import HTTP1Connection
-from tornado.httpserver import HTTPServer
-from tornado.iostream import IOStream, StreamClosedError
-from tornado.netutil import bind_sockets
-from tornado.web import Application, HTTPError, RequestHandler
-
 from starpos.errors import StarposError, one_line
 from starpos.report.coast import COAST_FILE
+
+try:
+    from tornado.http1connection import HTTP1Connection
+    from tornado.httpserver import HTTPServer
+    from tornado.iostream import IOStream, StreamClosedError
+    from tornado.netutil import bind_sockets
+    from tornado.web import Application, HTTPError, RequestHandler
+except ImportError:
+    raise StarposError(
+        "the dashboard needs tornado, which is not installed: sudo apt install python3-tornado, "
+        "or pip install tornado"
+    ) from None
 
 HOST_NAME = re.compile(r"\[[0-9a-fA-F:.%]+\]|[A-Za-z0-9._-]+")
 HEADERS = {
@@ -45,7 +50,6 @@ HEADERS = {
 
 
 def own_names() -> frozenset[str]:
-    """The names of this machine."""
     name = socket.gethostname().lower()
     return frozenset({"localhost", name, f"{name}.local"})
 
@@ -100,25 +104,12 @@ TYPES = {
 }
 
 
-class DashboardError(StarposError):
-    """The page cannot be served."""
-
-
-@dataclass(eq=False)
-class OpenPage:
-    """A page that is open. `looks`: it shows the frame; `sent`: number of the last fix that was sent to it."""
-
-    looks: bool
-    news: asyncio.Event = field(default_factory=asyncio.Event)
-    sent: int = 0
-
-
 def listen(address: str, port: int) -> list[socket.socket]:
-    """Bind the sockets; DashboardError that says what to do if they cannot be bound."""
+    """Bind the sockets; StarposError that says what to do if they cannot be bound."""
     try:
         return bind_sockets(port, address)
     except UnicodeError:
-        raise DashboardError(
+        raise StarposError(
             f"{address[:80]!r} is no address: set the parameter address to one of this machine's"
         ) from None
     except OSError as e:
@@ -127,7 +118,7 @@ def listen(address: str, port: int) -> list[socket.socket]:
             13: "set port above 1023",
         }
         cure = cures.get(e.errno or 0, "set the parameter address to one of this machine's")
-        raise DashboardError(
+        raise StarposError(
             f"{address}:{port} cannot be listened on ({one_line(e.strerror)}): {cure}"
         ) from None
 
@@ -163,7 +154,7 @@ class DashboardServer:
         self.frame: bytes | None = None
         self.state = ""
         self.track: Track = ()
-        self.open: set[OpenPage] = set()
+        self.open: set[Events] = set()
         self.trouble = ""
         self._sockets = sockets
         self._thread = threading.Thread(target=self._run, name="dashboard", daemon=True)
@@ -176,13 +167,7 @@ class DashboardServer:
 
     @property
     def pages(self) -> int:
-        """Number of open pages."""
         return len(self.open)
-
-    @property
-    def looking(self) -> bool:
-        """Whether an open page shows the frame."""
-        return any(page.looks for page in tuple(self.open))
 
     @property
     def alive(self) -> bool:
@@ -196,9 +181,6 @@ class DashboardServer:
         """Send the newest state (JSON), and the part of the track that a page does not have yet."""
         self.state, self.track = state, track
         self._call(self._wake)
-
-    def show_frame(self, jpeg: bytes | None) -> None:
-        self.frame = jpeg
 
     def stop(self) -> None:
         """Close every connection and end the thread."""
@@ -285,7 +267,6 @@ class Reply(RequestHandler):
     def prepare(self) -> None:
         headers = self.request.headers
         if self.request.method not in ("GET", "HEAD"):
-            self.set_header("Allow", "GET, HEAD")
             raise HTTPError(405, reason="this page only shows: GET and HEAD")
         if not host_is_known(headers.get("Host", ""), self.server.names):
             raise HTTPError(
@@ -346,9 +327,12 @@ class FrameReply(Reply):
 
 
 class Events(Reply):
-    """Sends state and track as they change."""
+    """Sends state and track as they change, to a page that is open."""
 
-    _page: OpenPage | None = None
+    def initialize(self) -> None:
+        self.news = asyncio.Event()
+        # Number of the last fix that was sent.
+        self._sent_fix = 0
 
     def head(self) -> None:
         self.set_header("Content-Type", "text/event-stream")
@@ -360,25 +344,23 @@ class Events(Reply):
             self.server.refused += 1
             self.write(f"event: full\ndata: {self.server.clients}\n\n")
             return
-        self._page = page = OpenPage(looks=self.request.query == "frame")
-        self.server.open.add(page)
+        self.server.open.add(self)
         try:
             while await self.deliver():
-                await page.news.wait()
-                page.news.clear()
-                self._write_news(page)
+                await self.news.wait()
+                self.news.clear()
+                self._write_news()
         finally:
-            self.server.open.discard(page)
+            self.server.open.discard(self)
 
-    def _write_news(self, page: OpenPage) -> None:
-        points = [p for p in self.server.track if p[0] > page.sent]
+    def _write_news(self) -> None:
+        points = [p for p in self.server.track if p[0] > self._sent_fix]
         if points:
-            whole = {"begin": page.sent == 0, "points": points}
+            whole = {"begin": self._sent_fix == 0, "points": points}
             self.write(f"event: track\ndata: {json.dumps(whole, separators=(',', ':'))}\n\n")
-            page.sent = points[-1][0]
+            self._sent_fix = points[-1][0]
         self.write(f"event: state\ndata: {self.server.state}\n\n")
 
     def on_connection_close(self) -> None:
-        if self._page:
-            # The page's loop wakes up, cannot deliver, and ends.
-            self._page.news.set()
+        # The page's loop wakes up, cannot deliver, and ends.
+        self.news.set()

@@ -3,11 +3,14 @@
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
 
 from starpos.errors import StarposError
+from starpos.frames.encodings import ENCODINGS, pixels_of
 from starpos.frames.frame import Frame
 from starpos.instrument.camera import Camera
 
@@ -56,7 +59,7 @@ class CapturedFrame:
 
 
 class FrameSource:
-    """A camera, made as SourceClass(values, now): the node's parameters, and its clock in Unix seconds.
+    """A camera, made as SourceClass(values, now): the node's parameters as they are at any time, its clock in Unix s.
 
     Making one opens no device and cannot fail for lack of one. `capture` opens the device if it is not open, so a
     device may come, go and come back. All methods except `close` and `capture` return at once. A module imports the
@@ -91,21 +94,25 @@ class FrameSource:
         """
         raise NotImplementedError
 
-    def update(self, values: Mapping) -> None:
-        """Apply changed parameters; may be called while `capture` runs."""
-        self._values = values
-
     def close(self) -> None:
         """Release the device; called once. A `capture` that still runs ends soon."""
 
 
-D = TypeVar("D")
+class Device(Protocol):
+    """What a DeviceSource keeps open."""
+
+    def release(self) -> object:
+        """Give the device up, which may have gone."""
+
+
+D = TypeVar("D", bound=Device)
 
 
 class DeviceSource(FrameSource, Generic[D]):
     """A source whose device is kept open between frames, and opened again after a failure.
 
-    A subclass opens its device, exposes with it, and looks at `_closing` while it waits.
+    A subclass opens its device, exposes with it, and looks at `_closing` while it waits. Its frames, remarks and errors
+    need no name of the camera: it is added here.
     """
 
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
@@ -119,13 +126,15 @@ class DeviceSource(FrameSource, Generic[D]):
             try:
                 if self._device is None:
                     self._device = self._open()
-                return self._expose(self._device, settings)
+                taken = self._expose(self._device, settings)
             except Exception as error:
                 self._release()
                 why = self._explain(error)
                 if why is None:
                     raise
                 raise CaptureError(f"{self.hardware_id}: {why}") from error
+        remark = taken.remark and f"{self.hardware_id}: {taken.remark}"
+        return replace(taken, frame=replace(taken.frame, source=self.hardware_id), remark=remark)
 
     def close(self) -> None:
         self._closing.set()
@@ -135,7 +144,7 @@ class DeviceSource(FrameSource, Generic[D]):
     def _release(self) -> None:
         device, self._device = self._device, None
         if device is not None:
-            self._close(device)
+            device.release()
 
     def _open(self) -> D:
         """Open the device; CaptureError if it is not there."""
@@ -144,12 +153,21 @@ class DeviceSource(FrameSource, Generic[D]):
     def _expose(self, device: D, settings: CaptureSettings) -> CapturedFrame:
         raise NotImplementedError
 
-    def _close(self, device: D) -> None:
-        """Give the device up, which may have gone."""
-
     def _explain(self, error: Exception) -> str | None:
         """Say in a sentence what an error means; None for a defect, which the node reports as one."""
         return str(error) if isinstance(error, StarposError) else None
+
+
+def decoded(encoding: str, data: bytes, size: tuple[int, int], more: int = 0) -> tuple[np.ndarray, str]:
+    """Pixels of a driver's buffer, and the pattern of their mosaic; CaptureError for a buffer of another length.
+
+    encoding: one of ENCODINGS.  size: width and height, px.  more: number of bytes after the pixels, to be left out.
+    """
+    width, height = size
+    row = ENCODINGS[encoding].row_bytes(width)
+    if len(data) != row * height + more:
+        raise CaptureError(f"a frame has {len(data)} bytes instead of {row * height + more}.")
+    return pixels_of(encoding, data, width, height, row, False, "the frame")
 
 
 def missing(module: str, package: str) -> str | None:

@@ -34,7 +34,6 @@ from starpos.frozen import at_once
 from starpos.identification import Identification, PointingPrior, Sky, field_of, fisheye, identify, triangles
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import DECENTRED, EQUIDISTANT, Camera
-from starpos.instrument.platepar import SkyPixels
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
@@ -395,21 +394,17 @@ SEEN_ABOVE_RAD = np.radians(10)
 
 def seen_by(
     camera: Camera, attitude: np.ndarray, site: Place, atmosphere: Atmosphere, utc_unix_s: float
-) -> SkyPixels:
-    """What pixels all over a fixed camera's frame show; attitude (3, 3): east, north, up at the site into C."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) all over a fixed camera's frame, and the ICRS directions (N, 3) that they show.
+
+    attitude (3, 3): east, north, up at the site into C.
+    """
     xy = _grid(camera, BORDER)
     xy = xy[camera.sees(*xy.T)]
     local = camera.directions(*xy.T) @ attitude
     high = local[:, 2] > np.sin(SEEN_ABOVE_RAD)
-    state = earth_state(utc_unix_s)
-    return SkyPixels(
-        xy=xy[high],
-        icrs=state.of_itrs(atmosphere.refraction().unbend(local[high]) @ site.plumb_axes),
-        utc_unix_s=utc_unix_s,
-        latitude=site.latitude,
-        longitude=site.longitude,
-        height_m=0.0 if np.isnan(site.height_m) else site.height_m,
-    )
+    itrs = atmosphere.refraction().unbend(local[high]) @ site.plumb_axes
+    return xy[high], earth_state(utc_unix_s).of_itrs(itrs)
 
 
 def hour_by_lens(

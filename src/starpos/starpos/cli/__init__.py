@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NoReturn
 
 from starpos import __version__
@@ -19,26 +20,10 @@ from starpos.parallel import BLAS_THREADS
 
 BAD_CALL = 2
 # the commands in the order of --help, which needs nothing else of them
-COMMANDS = {
-    "solve": "position and heading of frames with their tilts",
-    "navigate": "position, heading and velocity of a voyage: frames and an IMU, while driving, sailing, flying",
-    "detect": "the stars of frames",
-    "identify": "where frames look, lost in space",
-    "replay": "solve recorded nights (rosbag2) with the solver's own code: the same fixes as in the running graph",
-    "calibrate": "A3 at a known place, or the camera, from identified stars",
-    "deflection": "deflection of the vertical at a known site, from a zenith camera's frames and tilts",
-    "stations": "many sessions of starpos deflection: repeats, differences from a geoid grid, GeoJSON",
-    "satellites": "a position from satellites among the stars and their orbits, without a level",
-    "altaz": "azimuth and altitude of any pixel of a frame at a known place, and pixels of directions",
-    "mount": "the axis about which a mount turned, against the pole; a horizontal circle's orientation",
-    "report": "nights on one page: stability, scatter, residuals, sky, error budget",
-    "simulate": "write a night of frames and tilts from a place you choose",
-    "demo": "draw a night at a hidden place, find it, and show it on a page, by the commands you would type",
-    "catalogue": "describe the star catalogue, or take another one",
-    "montecarlo": "identify random fields, and count successes: the paper's table",
-    "first-night": "focus, exposure, level, clock, signs, A3 by turning: step by step, live, until it is saved",
-    "doctor": "which parts that starpos needs this machine has, which are missing, and what to type",
-}
+COMMANDS = dict(
+    line.split(": ", 1)
+    for line in Path(__file__).with_name("data").joinpath("commands.txt").read_text("utf-8").splitlines()[1:]
+)
 
 
 class CommandParser(argparse.ArgumentParser):

@@ -6,7 +6,7 @@ import itertools
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,11 +27,6 @@ from starpos.parameters.table import rows_of
 from starpos.tables import TableForm
 from starpos.units import utc_text
 
-COLUMNS = ("file", "utc", "x", "y", "azimuth", "altitude", "altitude_airless", "sigma_across_arcsec",
-           "sigma_altitude_arcsec")  # fmt: skip
-HEAD = (
-    "pixel x, y: azimuth (deg, from north over east), altitude as seen and without air, 1 sigma across and up"
-)
 POINTS = TableForm(what="table of pixels", error=FrameError, needed=("x", "y"))
 # an identified star at this share of a point's distance from the axis, or more, shows the lens there
 REACH = 0.95
@@ -41,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     for name, values in (("X Y", args.pixels), ("--back AZ ALT", args.back)):
         if len(values) % 2:
             raise InstrumentError(f"{name}: {len(values)} numbers are no pairs: give two for each point")
-    overwriting.check(args, overlay=overwriting.picture)
+    overwriting.check(args, overlay=overwriting.ours)
     ground = None if args.horizon is None else horizon.read(args.horizon)
     args.frames, pixels = [args.frame], np.reshape(args.pixels, (-1, 2))
     if args.points is not None:
@@ -98,7 +93,7 @@ class _Seen:
 
 def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
     """Print the azimuth and altitude of pixels (N, 2)."""
-    output, found = console.Output(args, COLUMNS, HEAD), seen.at_place
+    output, found = console.Output(args, "pixels"), seen.at_place
     rays = seen.camera.directions(*points.T)
     sigma = np.hypot(args.stddev_px, found.jitter_px) / seen.camera.fx
     at = horizontal(seen.optics, rays, sigma)
@@ -118,7 +113,7 @@ def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
     )
     for row in np.transpose(columns).tolist():
         x, y, azimuth, altitude, without, across, up = row
-        values = dict(zip(COLUMNS, (args.frame, utc_text(found.utc_unix_s), *row), strict=True))
+        values = dict(zip(output.columns, (args.frame, utc_text(found.utc_unix_s), *row), strict=True))
         output.put(
             values,
             f"{x:.2f} {y:.2f}: {azimuth:.4f} {altitude:.4f} ({without:.4f}) "
@@ -132,8 +127,6 @@ ALTITUDES, AZIMUTHS, ALONG = (0, 15, 30, 45, 60, 75), range(0, 360, 30), 0.5
 # altitude's stands from the line of the azimuth, deg
 LABEL_PX, LOWEST, OFF_THE_LINES = 20, 5, 3
 NAMES = {0: "N", 90: "E", 180: "S", 270: "W"}
-# frames are enlarged up to this length of the longer side
-SMALLEST_PX = 1000
 # bytes of a PNG up to the end of its first chunk
 PNG_HEADER = 33
 # blue, green, red
@@ -167,23 +160,6 @@ def _shade(picture: np.ndarray, seen: _Seen, n: int, ground: np.ndarray) -> None
     picture[below] = picture[below] // 3
 
 
-def _enlarged(
-    frame: Frame, stars: Stars, seen: _Seen, points: np.ndarray, n: int
-) -> tuple[Frame, Stars, _Seen, np.ndarray]:
-    """Enlarge a frame and what lies on it n times, so that there is room for names and numbers."""
-    width, height, c = n * frame.width, n * frame.height, seen.camera
-    camera = replace(
-        c.scaled(n), width=width, height=height, cx=(c.cx + 0.5) * n - 0.5, cy=(c.cy + 0.5) * n - 0.5
-    )
-    x, y = ((v + 0.5) * n - 0.5 for v in (stars.x, stars.y))
-    return (
-        replace(frame, pixels=frame.pixels.repeat(n, 0).repeat(n, 1)),
-        replace(stars, width=width, height=height, x=x, y=y),
-        replace(seen, camera=camera),
-        (points + 0.5) * n - 0.5,
-    )
-
-
 def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None) -> None:
     """Draw the frame with stars, the grid, constellations and the points, the ground (N, 2) in deg darkened."""
     import cv2
@@ -195,8 +171,6 @@ def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None)
         raise InstrumentError(
             f"{path}: a list of stars has no picture to draw on: give a frame for --overlay"
         )
-    if not frame.pattern and (larger := SMALLEST_PX // max(frame.width, frame.height)) > 1:
-        frame, stars, seen, points = _enlarged(frame, stars, seen, points, larger)
     star, magnitudes = (np.zeros(0) if v is None else v for v in (solution.star, solution.magnitudes))
     named = Identified(star=star.astype(int).tolist(), names=solution.names, magnitudes=magnitudes.tolist())
     picture = annotate(frame, stars, named)

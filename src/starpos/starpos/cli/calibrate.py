@@ -15,22 +15,20 @@ from starpos import rotation
 from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, hour_by_lens, rms, seen_by
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
-from starpos.cli import console, inputs, options, overwriting, places_file, watch_output
+from starpos.cli import console, inputs, options, overwriting, watch_output
 from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of, stated_site
-from starpos.cli.options import vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, PlaceError, StarposError
 from starpos.files import save
-from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn
+from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn, unnamed_inclinometer
 from starpos.fix.heading import confirms_hour
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame, Stars
 from starpos.frames.reading import why_no_time
 from starpos.frames.tables import TILTS, Pointing, read_pointings
-from starpos.identification import Identification
 from starpos.instrument import instrument_file, platepar
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import up_of
@@ -39,8 +37,8 @@ from starpos.instrument.tilt_log import TiltLog
 from starpos.night import horizon
 from starpos.night.extinction import light_of
 from starpos.night.opening import frames_in
-from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
-from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_inclinometer, of_left_out
+from starpos.night.reading import NO_CAMERA, Instruments, Reader
+from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_left_out
 from starpos.night.together import axis_of, circles_of
 from starpos.night.watching import Answer, kept, night_poses, sky_mag
 from starpos.night.work import Solving
@@ -51,27 +49,26 @@ from starpos.units import ARCSEC
 def check_site(args: argparse.Namespace) -> None:
     """Raise InstrumentError for options that do not fit together."""
     deflection = (args.xi, args.eta, args.deflection_stddev, args.geoid, args.altitude_m) != (None,) * 5
-    if args.site is None:
-        if deflection:
-            raise InstrumentError("the deflection is for a calibration at a known place: give --site LAT LON")
-        return
+    if deflection and args.site is None:
+        raise InstrumentError("the deflection is for a calibration at a known place: give --site LAT LON")
     if deflection and not args.geodetic:
         raise InstrumentError(
             "--xi, --eta, --deflection-stddev, --geoid and --altitude-m are of a place on WGS 84: say --geodetic, or "
             "leave them out"
         )
-    if not _camera_alone(args) and (args.output is None or (args.tilt is None and not args.fixed)):
+    if args.site is None:
+        return
+    levelled = args.tilt is not None or args.fixed
+    # without a level and a file of A3, the place gives the camera its level
+    if (args.camera is None or levelled or args.output is not None) and not (
+        args.output is not None and levelled
+    ):
         raise InstrumentError(
             "--site needs the tilts and a file to write: give --tilt CSV and -o INSTRUMENT.yaml (or --fixed in place of "
             "--tilt), or --camera OUT.yaml alone"
         )
     # one sentence for a place that cannot be
     Place.by_gravity(*args.site)
-
-
-def _camera_alone(args: argparse.Namespace) -> bool:
-    """Whether the place only serves the camera: its level without tilts."""
-    return args.camera is not None and args.tilt is None and not args.fixed and args.output is None
 
 
 def check_output(args: argparse.Namespace, instrument: Instrument) -> None:
@@ -94,7 +91,7 @@ def run_site(
     known: identifications of the frames so far.
     """
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
-    site, bar = _site(args), console.ProgressBar()
+    site, bar = options.camera_place_of(args), console.ProgressBar()
     if tilts is None:
         sag = SAG_ARCSEC_PER_SQRT_HOUR if args.sag is None else args.sag
         found = calibrate_fixed(solver, frames, site, sag, bar, known)
@@ -112,7 +109,7 @@ def run_site(
         )
     else:
         found = calibrate_at(solver, frames, tilts, site, options.turn_of(args), bar, known)
-        console.complain(*of_inclinometer(instrument))
+        console.complain(unnamed_inclinometer(instrument))
     for solution in found.solutions:
         if solution.fix is None:
             console.complain(f"left out: {solution.message}")
@@ -131,9 +128,9 @@ def run_elevations(
     for row in circles_of(solver, pointings, tilts):
         if isinstance(row, StarposError):
             console.complain(f"left out: {row}")
-    site = _site(args)
+    site = options.camera_place_of(args)
     found = axis_of(solver, pointings, tilts, site=site)
-    console.complain(*of_left_out(found.left_out), *of_inclinometer(instrument))
+    console.complain(of_left_out(found.left_out), unnamed_inclinometer(instrument))
     scatter = np.sqrt(1 + found.scatter2)
     if scatter > SCATTERED and found.stddev_arcsec > WORTH_SAVING_ARCSEC:
         raise FixError(
@@ -159,13 +156,6 @@ def _save(args: argparse.Namespace, found: Calibrated, about: str) -> None:
         instrument = replace(instrument, calibration=lasting)
     save_instrument(args.output, instrument, about, camera_found=args.camera is not None)
     console.tell(args, _json_of_site(found, args.output), about.rstrip())
-
-
-def _site(args: argparse.Namespace) -> Place:
-    if args.geodetic:
-        latitude_deg, longitude_deg = args.site
-        return Place.on_ellipsoid(latitude_deg, longitude_deg, vertical_of(args))
-    return Place.by_gravity(*args.site)
 
 
 def _text_of(site: Place) -> str:
@@ -212,12 +202,8 @@ def _json_of_site(found: Calibrated, path: str) -> dict:
     }
 
 
-# Exit status.
-NOTHING = 1
 # elevations that scatter by more, in stated sigmas, contradict what is stated with them
 SCATTERED = 3.0
-# the stars of a frame, and their identification
-_Seen = tuple[Stars, Identification | None]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -236,7 +222,7 @@ def run(args: argparse.Namespace) -> int:
     overwriting.check(
         args,
         camera=overwriting.camera,
-        map=overwriting.picture,
+        map=overwriting.ours,
         platepar=overwriting.never,
         output=instrument_file.check_replaceable,
     )
@@ -245,7 +231,7 @@ def run(args: argparse.Namespace) -> int:
     if args.pointings is not None:
         return _from_pointings(args)
     read, args.frames = reader_of(args), frames_among(args.frames, args.tilt)
-    first = First(read)(tuple(args.frames))
+    first = read.first(args.frames)
     if first is None:
         # each frame says why it cannot be read
         _sights(args.frames, read, Instruments(None))
@@ -258,28 +244,29 @@ def run(args: argparse.Namespace) -> int:
         check_output(args, given.instrument)
     sights, unreadable = _sights(args.frames, read, given)
     solver, alike = of_one_camera(Solver(given.instrument, catalogue.load_catalogue()), sights)
-    frames = [(sight.stars, sight.found) for sight in alike]
+    frames = [sight.stars for sight in alike]
+    known = {n: sight.found for n, sight in enumerate(alike) if sight.found is not None}
     instrument = solver.instrument
     if given.sought:
         check_output(args, instrument)
-    tilts = _tilts(args, instrument)
+    tilts = None if args.tilt is None else checked_tilts(args.tilt, instrument).log
     try:
         if args.camera is not None:
-            camera = _camera(args, frames, instrument, tilts)
+            camera = _camera(args, frames, known, instrument, tilts)
             if args.site is None:
                 console.complain("an A3 belongs to the camera it was found with: find it again with this one")
-            frames = [
-                (s, k and k.but(focal_scale=k.focal_scale * instrument.focal_px / camera.fx))
-                for s, k in frames
-            ]
+            known = {
+                n: k.but(focal_scale=k.focal_scale * instrument.focal_px / camera.fx)
+                for n, k in known.items()
+            }
             instrument = replace(instrument, camera=camera, focal_px=camera.fx)
         if args.output is not None:
-            run_site(args, [s for s, _ in frames], instrument, tilts, _known(frames))
+            run_site(args, frames, instrument, tilts, known)
     except (CalibrationError, FixError, PlaceError) as e:
         console.complain(e)
-        if not _known(frames):
-            console.complain(*Solving(replace(given, instrument=instrument)).fitting(frames[0][0]))
-        return console.UNREADABLE if unreadable else NOTHING
+        if not known:
+            console.complain(Solving(replace(given, instrument=instrument)).fitting(frames[0]))
+        return console.UNREADABLE if unreadable else console.NOTHING
     return console.UNREADABLE if unreadable else 0
 
 
@@ -288,13 +275,17 @@ def _watch(args: argparse.Namespace) -> int:
     if args.frames:
         raise FrameError("--watch names the folder of the nights: leave out the frames")
     args.frames = _frames_below(Path(args.watch))
-    overwriting.check(args, page=places_file.check_ours, horizon=overwriting.never)
-    site = _site(args)
+    overwriting.check(args, page=overwriting.ours, horizon=overwriting.never)
+    site = options.camera_place_of(args)
     answers, stars = [], []
     for item, sight, camera in inputs.seen_at(args, site):
-        sky = sky_mag(item, sight.stars, sight.solution, camera) if isinstance(item, Frame) else np.nan
-        light = light_of(sight.stars, sight.solution, camera)
-        answers.append(Answer(solution=sight.solution, focal_px=camera.fx, light=light, sky_mag=sky))
+        found = sight.solution
+        assert found.at_place is not None
+        sky = sky_mag(item, sight.stars, found, camera) if isinstance(item, Frame) else np.nan
+        light, number = light_of(sight.stars, found, camera), len(found.names)
+        answers.append(
+            Answer(at_place=found.at_place, stars=number, focal_px=camera.fx, light=light, sky_mag=sky)
+        )
         if args.horizon is not None:
             stars.append(horizon.expected(sight, camera, catalogue.load_catalogue()))
     nights = kept(night_poses(answers, site.longitude))
@@ -311,7 +302,7 @@ def _watch(args: argparse.Namespace) -> int:
         horizon.write(
             Path(args.horizon), horizon.horizon(stars, float(np.median(known)) if known else np.nan)
         )
-    return NOTHING if not nights or any(n.alarm for n in nights) else 0
+    return console.NOTHING if not nights or any(n.alarm for n in nights) else 0
 
 
 def _frames_below(folder: Path) -> list[str]:
@@ -345,13 +336,6 @@ def _open_night(args: argparse.Namespace) -> None:
         args.tilt = str(tilts)
 
 
-def _tilts(args: argparse.Namespace, instrument: Instrument) -> TiltLog | None:
-    """The table of --tilt, None without one."""
-    if args.tilt is None:
-        return None
-    return checked_tilts(args.tilt, instrument).log
-
-
 def _from_pointings(args: argparse.Namespace) -> int:
     """Calibrate from the pointings of a plate solver, or from elevations if none has a roll; returns the exit status."""
     pointings = read_pointings(args.pointings)
@@ -361,7 +345,7 @@ def _from_pointings(args: argparse.Namespace) -> int:
         console.complain(f"{len(pointings) - len(whole)} pointings without a roll are left out")
     instrument = options.instrument_of(args, NO_CAMERA)
     check_output(args, instrument)
-    tilts = _tilts(args, instrument)
+    tilts = None if args.tilt is None else checked_tilts(args.tilt, instrument).log
     try:
         if elevations and tilts is not None:
             run_elevations(args, elevations, instrument, tilts)
@@ -369,7 +353,7 @@ def _from_pointings(args: argparse.Namespace) -> int:
             run_site(args, whole, instrument, tilts)
     except FixError as e:
         console.complain(e)
-        return NOTHING
+        return console.NOTHING
     return 0
 
 
@@ -389,27 +373,30 @@ def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> tuple[lis
     return sights, unreadable
 
 
-def _known(frames: Sequence[_Seen]) -> dict[int, Identification]:
-    """Identifications of frames, by their numbers."""
-    return {n: found for n, (_, found) in enumerate(frames) if found is not None}
-
-
 def _camera(
-    args: argparse.Namespace, seen: list[_Seen], instrument: Instrument, tilts: TiltLog | None
+    args: argparse.Namespace, frames: list[Stars], known: Known, instrument: Instrument, tilts: TiltLog | None
 ) -> Camera:
     """Fit the camera of --camera, write, draw and print it."""
-    air, (first, _) = options.atmosphere_of(args), seen[0]
+    air, first = options.atmosphere_of(args), frames[0]
     given = instrument.camera_for(first.width, first.height, first.origin_px)
-    if {(f.width, f.height, f.origin_px) for f, _ in seen} != {(given.width, given.height, first.origin_px)}:
+    if {(f.width, f.height, f.origin_px) for f in frames} != {(given.width, given.height, first.origin_px)}:
         raise InstrumentError(
             "the frames differ in size or part of the sensor: give frames of one for --camera"
         )
-    levels: Sequence[np.ndarray | None] = [None] * len(seen)
+    levels: list[np.ndarray | None] = [None] * len(frames)
     if tilts is not None:
-        seen, levels = _levelled(seen, instrument, tilts)
-    frames, bar = [stars for stars, _ in seen], console.ProgressBar()
-    site = _site(args) if args.site is not None and tilts is None else None
-    found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, bar, _known(seen), site)
+        levels = [_level(stars, instrument, tilts) for stars in frames]
+        kept = [n for n, level in enumerate(levels) if level is not None]
+        if not kept:
+            raise CalibrationError(
+                "no frame has a tilt: check that --tilt is of the same night, or leave it out"
+            )
+        known = {k: known[n] for k, n in enumerate(kept) if n in known}
+        frames, levels = [frames[n] for n in kept], [levels[n] for n in kept]
+    site = options.camera_place_of(args) if args.site is not None and tilts is None else None
+    found = calibrate_camera(
+        frames, levels, given, catalogue.load_catalogue(), air, console.ProgressBar(), known, site
+    )
     for k in sorted(set(range(len(frames))) - set(found.used)):
         console.complain(f"{frames[k].source}: no part of the sky matches it: it is left out")
     if tilts is None and site is None:
@@ -444,33 +431,27 @@ def _write_platepar(
             "of one pose"
         )
     times = [frames[k].mid_unix_s or 0.0 for k in found.used]
-    seen = seen_by(camera, mean, site, air, times[len(times) // 2])
-    plate, worst = platepar.platepar_of(camera, seen)
+    middle_s = times[len(times) // 2]
+    place = site.latitude, site.longitude, 0.0 if np.isnan(site.height_m) else site.height_m
+    seen = seen_by(camera, mean, site, air, middle_s)
+    plate, worst = platepar.platepar_of(camera, *seen, middle_s, place)
     save(path, (json.dumps(plate, indent=4, sort_keys=True) + "\n").encode(), "the platepar")
     console.complain(
         f"{path}: RMS sees stars within {worst:.2f} px of this camera; the platepar has no photometry"
     )
 
 
-def _levelled(
-    frames: Sequence[_Seen], instrument: Instrument, tilts: TiltLog
-) -> tuple[list[_Seen], list[np.ndarray]]:
-    """The frames that have a tilt, with the rotation (3, 3) of C into L for each; complains about the others."""
-    kept: list[_Seen] = []
-    levels: list[np.ndarray] = []
-    for stars, found in frames:
-        try:
-            if stars.mid_unix_s is None:
-                raise FrameError(f"no time of exposure: {why_no_time(stars)}")
-            tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
-            instrument.inclinometer.check_live(tilt)
-            levels.append(instrument.mounting.level(tilt).camera)
-            kept.append((stars, found))
-        except StarposError as e:
-            console.complain(f"{stars.source} is left out: {e}")
-    if not kept:
-        raise CalibrationError("no frame has a tilt: check that --tilt is of the same night, or leave it out")
-    return kept, levels
+def _level(stars: Stars, instrument: Instrument, tilts: TiltLog) -> np.ndarray | None:
+    """The rotation (3, 3) of C into L of a frame; None, after a complaint, if it has no tilt."""
+    try:
+        if stars.mid_unix_s is None:
+            raise FrameError(f"no time of exposure: {why_no_time(stars)}")
+        tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
+        instrument.inclinometer.check_live(tilt)
+        return instrument.mounting.level(tilt).camera
+    except StarposError as e:
+        console.complain(f"{stars.source} is left out: {e}")
+        return None
 
 
 def _tell_what_tilts_would(fit: Intrinsics, air: Atmosphere, frames: Sequence[Stars]) -> None:

@@ -28,7 +28,7 @@ class Command:
     epilog       what stands below its options
     examples, next_step   the end of its --help
     options      rows as `add_options` takes them
-    kinds        commands of its own, of which a call names one; it may name none if there are options, too
+    kinds        commands of its own, of which a call names one
     """
 
     text: str
@@ -48,11 +48,7 @@ class Command:
         parser.epilog = "\n\n".join(filter(None, ends))
         add_options(parser, self.options)
         if self.kinds:
-            names = "|".join(self.kinds)
-            optional = bool(self.options)
-            kinds = parser.add_subparsers(
-                dest="kind", required=not optional, metavar=f"[{names}]" if optional else names
-            )
+            kinds = parser.add_subparsers(dest="kind", required=True, metavar="|".join(self.kinds))
             for name, row in self.kinds.items():
                 kind = Command(**row)
                 kind.define(kinds.add_parser(name, help=kind.text))

@@ -10,10 +10,15 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from multiprocessing import parent_process
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from starpos.parameters.table import rows_of
+
+OUTPUTS = Path(__file__).with_name("data") / "outputs.yaml"
 # Exit status: no answer; input that cannot be read.
 NOTHING, UNREADABLE = 1, 2
 # s of work that needs no bar
@@ -31,6 +36,11 @@ def tell(args: argparse.Namespace, value: dict, line: str) -> None:
         print_json(value)
     else:
         print(line, flush=True)
+
+
+def values(of: object, names: str) -> dict:
+    """Attributes of an object by their names, as the object of --json has them too."""
+    return {name: getattr(of, name) for name in names.split()}
 
 
 def plain(value: Any) -> Any:
@@ -103,7 +113,8 @@ class ProgressBar:
 
     def __call__(self, what: str, done: float) -> None:
         soon = time.monotonic() - self.begin < BAR_AFTER_S and not self.shown
-        if soon or not sys.stderr.isatty():
+        # several processes would write over each other's
+        if soon or not sys.stderr.isatty() or parent_process() is not None:
             return
         self.shown = True
         filled = int(30 * min(done, 1.0))
@@ -119,13 +130,13 @@ class ProgressBar:
 class Output:
     """Writes one answer after another; the first line describes them, except in JSON.
 
-    columns: keys of the answers that are columns of the CSV.  head: the first line for people.
-    answers: all that were written.
+    kind: a row of data/outputs.yaml.  answers: all that were written.
     """
 
-    def __init__(self, args: argparse.Namespace, columns: Sequence[str], head: str) -> None:
-        self._json, self._head = args.json, head
-        self._rows = csv.DictWriter(sys.stdout, columns, extrasaction="ignore", lineterminator="\n")
+    def __init__(self, args: argparse.Namespace, kind: str) -> None:
+        self._json, self._head = args.json, rows_of(OUTPUTS)[kind].get("head", "")
+        self.columns = columns_of(kind)
+        self._rows = csv.DictWriter(sys.stdout, self.columns, extrasaction="ignore", lineterminator="\n")
         self._csv, self._begun = args.csv, False
         self.answers: list[dict] = []
 
@@ -145,6 +156,12 @@ class Output:
                 print(self._head)
             print(line, flush=True)
         self._begun |= self._csv or bool(line)
+
+
+def columns_of(kind: str) -> Sequence[str]:
+    """The columns of --csv of a kind of output."""
+    columns: Sequence[str] = rows_of(OUTPUTS)[kind]["columns"]
+    return columns
 
 
 def _cell(value: object) -> object:

@@ -2,8 +2,7 @@
 """`starpos deflection`: the deflection of the vertical at a known site, from a zenith camera's frames and tilts."""
 
 import argparse
-import os
-from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,21 +10,17 @@ import numpy as np
 from starpos.cli import console, inputs, options
 from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, InstrumentError, TiltError
+from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.solution import Solution
-from starpos.instrument.instrument import Instrument, with_frame_size
-from starpos.night.at_mark import ZenithSighted
+from starpos.instrument.instrument import Instrument
+from starpos.night.at_mark import zenith_seen
 from starpos.night.bag import each_frame, is_bag
-from starpos.night.reading import First
-from starpos.night.remarks import of_inclinometer
-from starpos.night.work import OnFile
+from starpos.night.opening import work_of
+from starpos.night.work import Solving
 from starpos.units import ARCSEC, utc_text
 from starpos.zenith.adjustment import DeflectionSession, FaceQuality, reduced
 from starpos.zenith.doubts import checked_session, remarks
 from starpos.zenith.sighting import ZenithSighting
-
-COLUMNS = ("file", "combined", "status", "utc", "face", "heading", "xi_arcsec", "eta_arcsec", "sigma_xi_arcsec",
-           "sigma_eta_arcsec", "stars_matched", "residual_arcsec", "faces", "frames")  # fmt: skip
-HEAD = "file: face, heading of the frame's top (deg), xi and eta (arcsec) of the frame alone, with the session's A3"
 
 
 def frame_json(path: str, found: DeflectionSession, k: int) -> dict:
@@ -63,46 +58,37 @@ def combined_json(
 ) -> dict:
     """The session's value; station: name of the mark, '' for none."""
     sigma_xi, sigma_eta = found.sigma_arcsec
-    return {
-        "combined": True,
-        "status": "ok",
-        "station": station,
-        "site": {
-            "latitude": np.degrees(mark.latitude),
-            "longitude": np.degrees(mark.longitude),
-            "height_m": mark.height_m,
-        },
-        "utc": utc_text(found.mid_unix_s),
-        "duration_s": found.sightings[-1].utc_unix_s - found.sightings[0].utc_unix_s,
-        "xi_arcsec": found.xi_arcsec,
-        "eta_arcsec": found.eta_arcsec,
-        "sigma_xi_arcsec": sigma_xi,
-        "sigma_eta_arcsec": sigma_eta,
-        "covariance_arcsec2": found.covariance_arcsec2,
-        "faces": int(found.faces.max()) + 1,
-        "frames": len(found.sightings),
-        "errors": {name: [xi, eta] for name, xi, eta in found.terms},
-        "correlations": found.correlations,
-        "image_motion_arcsec": found.air.motion / ARCSEC,
-        "anomalous_refraction_arcsec": found.air.anomalous / ARCSEC,
-        "catalogue_factor": found.catalogue_factor,
-        "chi2_per_degree": found.chi2_per_degree,
-        "misalignment_deg": found.misalignment_deg,
-        "reduced": without,
-        "by_face": [_face_json(face) for face in found.face_quality],
-        "stars": len(found.stars),
-    }
+    return (
+        {
+            "combined": True,
+            "status": "ok",
+            "station": station,
+            "site": {
+                "latitude": np.degrees(mark.latitude),
+                "longitude": np.degrees(mark.longitude),
+                "height_m": mark.height_m,
+            },
+            "utc": utc_text(found.mid_unix_s),
+            "duration_s": found.sightings[-1].utc_unix_s - found.sightings[0].utc_unix_s,
+            "sigma_xi_arcsec": sigma_xi,
+            "sigma_eta_arcsec": sigma_eta,
+            "faces": int(found.faces.max()) + 1,
+            "frames": len(found.sightings),
+            "errors": {name: [xi, eta] for name, xi, eta in found.terms},
+            "image_motion_arcsec": found.air.motion / ARCSEC,
+            "anomalous_refraction_arcsec": found.air.anomalous / ARCSEC,
+            "reduced": without,
+            "by_face": [_face_json(face) for face in found.face_quality],
+            "stars": len(found.stars),
+        }
+        | console.values(found, "xi_arcsec eta_arcsec covariance_arcsec2 correlations catalogue_factor")
+        | console.values(found, "chi2_per_degree misalignment_deg")
+    )
 
 
 def _face_json(face: FaceQuality) -> dict:
-    return {
-        "face": face.number + 1,
-        "heading": face.heading_deg,
-        "frames": face.frames,
-        "off_arcsec": face.off_arcsec,
-        "stddev_arcsec": face.stddev_arcsec,
-        "chi2": face.chi2,
-    }
+    about = console.values(face, "frames off_arcsec stddev_arcsec chi2")
+    return {"face": face.number + 1, "heading": face.heading_deg} | about
 
 
 def combined_text(found: DeflectionSession, value: dict) -> str:
@@ -134,39 +120,31 @@ def _face_text(face: dict) -> str:
 
 def run(args: argparse.Namespace) -> int:
     mark = _mark_of(args)
-    taken = _of_bag(args, mark) if _is_bag(args) else _of_files(args, mark)
-    return console.UNREADABLE if taken is None else _tell(args, taken, mark)
+    return _tell(args, _of_bag(args, mark) if _is_bag(args) else _of_files(args, mark), mark)
 
 
-@dataclass(frozen=True, eq=False)
-class _Taken:
-    """A session's frames: their names, and their sightings or the errors."""
-
-    names: list[str]
-    answers: list[ZenithSighting | Solution | FrameError]
-    instrument: Instrument
+# names of a session's frames, their sightings or the errors, and the instrument
+_Taken = tuple[list[str], list[ZenithSighting | Solution | FrameError], Instrument]
 
 
-def _of_files(args: argparse.Namespace, mark: Place) -> _Taken | None:
-    """The sightings of files; None where no frame can be read, which has been said."""
+def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
+    """The sightings of files."""
     if not args.frames or args.tilt is None:
         raise InstrumentError("give frames and --tilt CSV, or a bag")
-    read = inputs.reader_of(args)
-    frames = inputs.frames_among(args.frames, args.tilt)
-    with inputs.workers_of(args, frames) as workers:
-        (about,) = workers.map([(First(read), tuple(frames))])
-        if about is None:
-            # says why
-            read(frames[0])
-            return None
-        instrument, doubt = with_frame_size(options.instrument_of(args, about), about)
-        console.complain(doubt)
-        given = replace(inputs.given_of(args, about), instrument=instrument)
-        tilts = inputs.checked_tilts(os.path.abspath(args.tilt), instrument)
-        inputs.prepare(instrument, about)
-        work = OnFile(read, ZenithSighted(given, options.atmosphere_of(args), tilts, mark))
-        answers = list(inputs.watched(workers.map((work, path) for path in frames), len(frames), lines=False))
-    return _Taken(frames, answers, instrument)
+    read, frames = inputs.reader_of(args), inputs.frames_among(args.frames, args.tilt)
+    about = read.first(frames)
+    if about is None:
+        # says why
+        read(frames[0])
+    assert about is not None
+    air = options.atmosphere_of(args)
+    given, remarks = work_of(inputs.given_of(args, about), about, Path(args.tilt), air)
+    console.complain(*remarks)
+    instrument = given.instruments.instrument
+    assert instrument is not None
+    inputs.prepare(instrument, about)
+    work = partial(read.on, partial(zenith_seen, given, mark))
+    return frames, list(inputs.worked(args, work, frames, lines=False)), instrument
 
 
 def _is_bag(args: argparse.Namespace) -> bool:
@@ -187,31 +165,30 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
         raise TiltError(f"{path}: no usable tilt in it: record the topic tilt too")
     if not found.star_count:
         raise FrameError(f"{path}: no stars and no images in it: record the topic stars too")
-    work = ZenithSighted(instruments, options.atmosphere_of(args), found.tilts, mark)
+    given = Solving(instruments, atmosphere=options.atmosphere_of(args), tilts=found.tilts)
     names, answers = [], []
     for name, item in inputs.watched(each_frame(found), found.star_count, lines=False):
         names.append(name)
-        answers.append(item if isinstance(item, FrameError) else work(item))
+        answers.append(item if isinstance(item, FrameError) else zenith_seen(given, mark, item))
     assert instruments.instrument is not None
-    return _Taken(names, answers, instruments.instrument)
+    return names, answers, instruments.instrument
 
 
 def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
     """Adjust the session and print it; returns the exit status."""
-    output = console.Output(args, COLUMNS, HEAD)
-    console.complain(*of_inclinometer(taken.instrument))
-    rows = list(zip(taken.names, taken.answers, strict=True))
+    output, (names, answers, instrument) = console.Output(args, "deflection"), taken
+    console.complain(unnamed_inclinometer(instrument))
+    rows = list(zip(names, answers, strict=True))
     for name, answer in rows:
         if not isinstance(answer, ZenithSighting):
             console.complain(_why(name, answer))
-    sightings = [answer for answer in taken.answers if isinstance(answer, ZenithSighting)]
+    sightings = [answer for answer in answers if isinstance(answer, ZenithSighting)]
     try:
-        session = checked_session(sightings, taken.instrument, options.atmosphere_of(args), mark)
+        session = checked_session(sightings, instrument, options.atmosphere_of(args), mark)
     except FixError as error:
         console.complain(error)
         return console.NOTHING
-    scale = taken.instrument.inclinometer.scale
-    console.complain(*remarks(session, len(rows), scale))
+    console.complain(*remarks(session, len(rows), instrument.inclinometer.scale))
     at = {id(s): k for k, s in enumerate(session.sightings)}
     for name, answer in rows:
         if isinstance(answer, ZenithSighting):
@@ -222,7 +199,7 @@ def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
     without = reduced(session, mark)
     whole = combined_json(session, without, mark, args.station)
     output.put(whole, combined_text(session, whole))
-    return console.UNREADABLE if any(isinstance(a, FrameError) for a in taken.answers) else 0
+    return console.UNREADABLE if any(isinstance(a, FrameError) for a in answers) else 0
 
 
 def _mark_of(args: argparse.Namespace) -> Place:

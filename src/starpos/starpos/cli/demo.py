@@ -19,7 +19,7 @@ from starpos.units import DAY_S, utc_text
 MAX_LATITUDE_DEG = 45.0
 DRAWN = ("-n", "4", "--size", "2808", "1872")
 # of the drawn instrument
-KNOWN = (
+KNOWN = [
     "--misalignment",
     "0",
     "0",
@@ -28,17 +28,16 @@ KNOWN = (
     "5",
     "--inclinometer",
     "sca100t_calibrated",
-)
+]
 
 
 def run(args: argparse.Namespace) -> int:
     folder = Path(args.out)
     rng = np.random.default_rng(args.seed)
     place_deg = rng.uniform(-MAX_LATITUDE_DEG, MAX_LATITUDE_DEG), rng.uniform(-180, 180)
-    try:
-        call = (_photographs if args.photo else _night)(folder, place_deg, rng)
-    except _Failed as e:
-        return e.status
+    call = (_photographs if args.photo else _night)(folder, place_deg, rng)
+    if isinstance(call, int):
+        return call
     places = folder / "place.geojson"
     calls = [("solve", *call, "-o", f"{places}")]
     if find_spec("matplotlib") is None:
@@ -61,16 +60,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-class _Failed(Exception):
-    """A command of the demo ended with this exit status."""
-
-    def __init__(self, status: int):
-        super().__init__(status)
-        self.status = status
-
-
-def _night(folder: Path, place_deg: tuple[float, float], rng: np.random.Generator) -> tuple[str, ...]:
-    """Draw a night of frames and tilts; the arguments that solve it."""
+def _night(folder: Path, place_deg: tuple[float, float], rng: np.random.Generator) -> tuple[str, ...] | int:
+    """Draw a night of frames and tilts; the arguments that solve it, or the exit status of a failure."""
     night = f"{folder / 'night'}"
     latitude, longitude = map(str, place_deg)
     place = ("--latitude", latitude, "--longitude", longitude, "--start", _midnight(place_deg[1]))
@@ -79,7 +70,7 @@ def _night(folder: Path, place_deg: tuple[float, float], rng: np.random.Generato
         flush=True,
     )
     if status := main(["simulate", night, *DRAWN, *place]):
-        raise _Failed(status)
+        return status
     return night, *KNOWN
 
 

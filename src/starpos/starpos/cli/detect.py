@@ -2,31 +2,27 @@
 """`starpos detect`: the stars of frames."""
 
 import argparse
+from functools import partial
 from typing import TYPE_CHECKING
 
 from starpos.cli import console, inputs
 from starpos.errors import FrameError
 from starpos.frames.frame import Stars
 from starpos.night.reading import Reader
-from starpos.night.work import OnFile, detected
+from starpos.night.work import detected
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
 
-# columns of --csv; the stars of --json have the same, without the file
-COLUMNS = ("file", "x", "y", "flux", "snr", "sigma_x", "sigma_y", "flags")
-
 
 def run(args: argparse.Namespace) -> int:
-    output = console.Output(args, COLUMNS, "")
+    output = console.Output(args, "stars")
     args.frames = inputs.frames_among(args.frames)
-    status, work, number = 0, OnFile(Reader(), detected), len(args.frames)
-    with inputs.workers_of(args, args.frames) as workers:
-        answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
-        for path, answer in zip(args.frames, answers, strict=True):
-            if isinstance(answer, FrameError):
-                status = console.UNREADABLE
-            _tell(path, answer, output)
+    status, answers = 0, inputs.worked(args, partial(Reader().on, detected), args.frames)
+    for path, answer in zip(args.frames, answers, strict=True):
+        if isinstance(answer, FrameError):
+            status = console.UNREADABLE
+        _tell(path, answer, output)
     return status
 
 
@@ -44,7 +40,9 @@ def _tell(path: str, answer: "tuple[Detection | Stars, float] | FrameError", out
     value = {"file": path, "stars": rows, "cpu_ms": cpu_ms, "negative": stars.negative}
     value |= {"left_out": left_out} if left_out else {}
     output.put(
-        value, _line(path, found, cpu_ms), [dict(zip(COLUMNS, (path, *row), strict=True)) for row in rows]
+        value,
+        _line(path, found, cpu_ms),
+        [dict(zip(output.columns, (path, *row), strict=True)) for row in rows],
     )
 
 

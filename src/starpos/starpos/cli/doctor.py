@@ -19,22 +19,12 @@ from pathlib import Path
 
 from starpos import __version__
 from starpos.cli import console
+from starpos.cli.commands import DATA
 from starpos.errors import StarposError, one_line
+from starpos.parameters.table import rows_of
 from starpos.units import DAY_S
 
-# modules that everything needs, with the names of their packages
-NEEDED = {"numpy": "numpy", "scipy": "scipy", "erfa": "pyerfa", "astropy": "astropy", "astropy_iers_data":
-          "astropy-iers-data", "cv2": "opencv-python-headless", "yaml": "PyYAML"}  # fmt: skip
-# modules that some work needs: their packages, and which work
-OPTIONAL = {
-    "matplotlib": ("matplotlib", "starpos report, calibrate --map"),
-    "rosbags": ("rosbags", "recorded nights: report, replay"),
-    "rawpy": ("rawpy", "raw files of cameras"),
-    "exifread": ("exifread", "times and lenses of photographs"),
-    "sgp4": ("sgp4", "starpos satellites"),
-    "pillow_heif": ("pillow-heif", "HEIF pictures of phones"),
-    "argcomplete": ("argcomplete", "completion of commands and options by the Tab key"),
-}
+PACKAGES = DATA / "packages.yaml"
 # OpenCV is one package of several
 CV2 = ("opencv-python-headless", "opencv-python", "opencv-contrib-python")
 SERIAL = ("dev/serial/by-id/*", "dev/ttyUSB*", "dev/ttyACM*")
@@ -101,10 +91,12 @@ def versions() -> Finding:
 
 def packages() -> Finding:
     """The packages that everything needs, and their versions."""
-    lacking = [package for module, package in NEEDED.items() if find_spec(module) is None]
+    lacking = [
+        package for module, package in rows_of(PACKAGES)["needed"].items() if find_spec(module) is None
+    ]
     if lacking:
         return Finding(State.MISSING, f"not here: {', '.join(lacking)}", f"pip install {' '.join(lacking)}")
-    return Finding(State.OK, ", ".join(f"{p} {_version(p)}" for p in NEEDED.values()))
+    return Finding(State.OK, ", ".join(f"{p} {_version(p)}" for p in rows_of(PACKAGES)["needed"].values()))
 
 
 def _version(package: str) -> str:
@@ -129,7 +121,11 @@ def compiled() -> Finding:
 
 def optional() -> Finding:
     """The packages that some work needs."""
-    lacking = {package: use for module, (package, use) in OPTIONAL.items() if find_spec(module) is None}
+    lacking = {
+        package: use
+        for module, (package, use) in rows_of(PACKAGES)["optional"].items()
+        if find_spec(module) is None
+    }
     if not lacking:
         return Finding(State.OK, "all optional packages are here")
     uses = "; ".join(f"{package} ({use})" for package, use in lacking.items())

@@ -19,7 +19,7 @@ from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.night import field
 from starpos.night.first_night import AROUND_S, FirstNight, Look, Stage
 from starpos.night.opening import exposures, frames_in
-from starpos.night.reading import About, Instruments, stars_of
+from starpos.night.reading import Instruments, stars_of
 from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import utc_text
@@ -80,8 +80,7 @@ def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None,
             seen.add(path)
             waited = time.monotonic()
             if night is None:
-                about = About(item.width, item.height, focal_px=item.focal_px, origin_px=item.origin_px)
-                given = given_of(args, about)
+                given = given_of(args, item)
                 air = options.atmosphere_of(args)
                 night = FirstNight(Solver(options.instrument_of(args, item), catalogue.load_catalogue(), air))
             sight = Solving(given)(item)

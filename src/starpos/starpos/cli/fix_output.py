@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lines, JSON keys and CSV columns of fixes and of headings at a known place: of a frame, and of a night together."""
 
+import argparse
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -8,30 +9,26 @@ import numpy as np
 
 from starpos.averaging.average import Average
 from starpos.averaging.poses import MeanAttitude, mean_attitude
+from starpos.averaging.sights import SextantSight
+from starpos.cli import console, options
 from starpos.cli.console import Output
 from starpos.earth.orientation import measured_until, table_age_days
 from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
-from starpos.errors import FixError
+from starpos.errors import FixError, StarposError
 from starpos.fix.attitude import Attitude
+from starpos.fix.circle import Circle
 from starpos.fix.directions import OPTICAL_AXIS, horizontal
 from starpos.fix.fix import InDegrees, PlaceFix, length_text
 from starpos.fix.heading import AttitudeAtPlace
-from starpos.fix.solution import Solution, Status
-from starpos.night.together import Gathered
+from starpos.fix.solution import Solution, Status, status_of
+from starpos.frames.tables import Pointing
+from starpos.night.remarks import Near
+from starpos.night.together import Gathered, Together
 from starpos.units import utc_text
 
 # numbers of an average that are printed
 COUNTS = ("frames", "poses", "left_out", "moved")
-# the first line for people
-HEAD = (
-    "file: latitude and longitude (deg, astronomic: by the plumb line) +- 1 sigma, heading (deg, from true "
-    "north over east) +- 1 sigma"
-)
-# columns of --csv: keys of --json with a single value
-COLUMNS = ("file", "combined", "night", "status", "utc", "latitude", "longitude", "heading", "latitude_geodetic",
-           "longitude_geodetic", "sigma_east_m", "sigma_north_m", "sigma_heading_deg", "stars_detected",
-           "stars_matched", "residual_arcsec", "log_odds", "warnings", "frames")  # fmt: skip
 
 
 def in_degrees(covariance: np.ndarray) -> np.ndarray:
@@ -111,25 +108,52 @@ def line_of(path: str, s: Solution, turning: bool) -> str:
 
 # the status of a row that gives an elevation
 ELEVATION = "elevation alone"
-ELEVATIONS_HEAD = "row: the zenith distance of its direction; together these give the position"
 
 
-def put_elevation(
+def tell_elevations(
+    args: argparse.Namespace,
     output: Output,
-    source: str,
-    utc_unix_s: float | None,
-    zenith_distance: float | None,
+    rows: Sequence[Pointing | SextantSight],
+    circles: Sequence[Circle | StarposError],
+    whole: Together,
     vertical: Vertical,
-    status: str = ELEVATION,
-) -> None:
-    """Write a row that gives a zenith distance (rad) alone, or None with the status that says why."""
-    deg = None if zenith_distance is None else np.degrees(zenith_distance)
-    utc = {} if utc_unix_s is None else {"utc": utc_text(utc_unix_s)}
+    near: Near | None,
+) -> int:
+    """Write rows that give a zenith distance alone, or why not, and the place that they give; returns the exit status."""
     none = dict.fromkeys(("residual_arcsec", "log_odds"))
-    about_stars = {"stars_detected": 0, "stars_matched": 0} | none | {"status": status, "warnings": []}
-    row = json_of(None, vertical) | utc | {"zenith_distance_deg": deg} | about_stars
-    about = status if deg is None else f"{deg:.5f} deg from the zenith"
-    output.put({"file": source} | row, f"{source}: {about}")
+    for row, circle in zip(rows, circles, strict=True):
+        utc_unix_s = row.utc_unix_s if isinstance(row, SextantSight) else row.mid_unix_s
+        if isinstance(circle, StarposError):
+            console.complain(circle)
+            deg, status = (
+                None,
+                status_of(row, circle).value if isinstance(row, Pointing) else Status.BAD_INPUT.value,
+            )
+            about = status
+        else:
+            deg, status = np.degrees(circle.zenith_distance), ELEVATION
+            about = f"{deg:.5f} deg from the zenith"
+        utc = {} if utc_unix_s is None else {"utc": utc_text(utc_unix_s)}
+        of_stars = {"stars_detected": 0, "stars_matched": 0} | none | {"status": status, "warnings": []}
+        values = (
+            {"file": row.source} | json_of(None, vertical) | utc | {"zenith_distance_deg": deg} | of_stars
+        )
+        output.put(values, f"{row.source}: {about}")
+    console.complain(whole.why_not, *whole.remarks)
+    if whole.average is not None or whole.why_not:
+        about_place = about_average(args, whole.average, vertical, near)
+        put_combined(output, None, whole.average, Gathered(), vertical, about_place)
+    return 0 if whole.average else console.NOTHING
+
+
+def about_average(
+    args: argparse.Namespace, place: PlaceFix | None, vertical: Vertical, near: Near | None
+) -> dict:
+    """The distance from --near, for --json, after a complaint if the geoid has no data at the place."""
+    if place is None:
+        return {}
+    options.tell_unknown(args, vertical.at(place.latitude, place.longitude))
+    return {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
 
 
 def put_combined(
@@ -194,14 +218,6 @@ def _lines_of(folder: str | None, together: Average, vertical: Vertical) -> str:
     return "\n".join(lines)
 
 
-# the first line for people
-HEADING_HEAD = (
-    "file: heading (deg, from true north over east) by the plumb line and on WGS 84, pitch (nose up) and roll (left side "
-    "up) by the plumb line, each +- 1 sigma"
-)
-# besides the columns of a fix
-HEADING_COLUMNS = (*COLUMNS, "pitch", "roll", "sigma_pitch_deg", "sigma_roll_deg", "heading_geodetic",
-           "sigma_heading_geodetic_deg", "pitch_geodetic", "roll_geodetic")  # fmt: skip
 # the keys of --json that come from a heading at a known place
 HEADING_KEYS: dict[str, Callable[[Attitude, Attitude], Any]] = {
     "heading": lambda plumb, _: np.degrees(plumb.heading),
@@ -303,13 +319,13 @@ def heading_text_of(found: AttitudeAtPlace | MeanAttitude) -> str:
     return f"heading {heading} (WGS 84: {on_ground}) deg, pitch {pitch}, roll {roll}"
 
 
-def mean_of(answers: Sequence[Solution]) -> tuple[MeanAttitude | None, tuple[str, ...]]:
-    """The mean attitude of the frames, or None with the reason; the reason is empty if no frame has an attitude."""
+def mean_of(answers: Sequence[Solution]) -> tuple[MeanAttitude | None, str]:
+    """The mean attitude of the frames, or None with the reason, which is empty if no frame has an attitude."""
     attitudes = [s.at_place for s in answers if s.at_place]
     try:
-        return (mean_attitude(attitudes) if attitudes else None), ()
+        return (mean_attitude(attitudes) if attitudes else None), ""
     except FixError as error:
-        return None, (str(error),)
+        return None, str(error)
 
 
 def _with_variance(covariance: np.ndarray | None, heading: float) -> np.ndarray:

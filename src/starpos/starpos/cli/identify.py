@@ -3,6 +3,7 @@
 
 import argparse
 import math
+from functools import partial
 
 import numpy as np
 
@@ -11,41 +12,30 @@ from starpos.errors import FrameError
 from starpos.fix.solution import Solution, Status
 from starpos.frames.frame import Stars
 from starpos.instrument.camera import EQUIDISTANT
-from starpos.night.work import OnFile
 from starpos.units import ARCSEC
-
-# of --csv
-COLUMNS = ("file", "status", "ra", "dec", "roll", "focal_px", "focal_stddev_px", "stars_detected", "stars_matched",
-           "residual_arcsec", "log_odds", "lens", "mirrored", "negative", "warnings", "cpu_ms")  # fmt: skip
-HEAD = (
-    "file: right ascension and declination of the middle of the frame (deg, ICRS), direction of its top (deg, from north "
-    "over east), stars identified of those detected"
-)
 
 
 def run(args: argparse.Namespace) -> int:
     args.frames = inputs.frames_among(args.frames)
-    any_found, unreadable, number = False, False, len(args.frames)
+    any_found, unreadable = False, False
     lost: Stars | None = None
     complaints = console.FrameComplaints()
-    read, output = inputs.reader_of(args), console.Output(args, COLUMNS, HEAD)
-    with inputs.workers_of(args, args.frames) as workers:
-        solving = inputs.identifying(args, args.frames, read, workers, args.search_time)
-        work = OnFile(read, solving)
-        answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
-        for path, answer in zip(args.frames, answers, strict=True):
-            if isinstance(answer, FrameError):
-                unreadable, found, cpu_ms = True, Solution.unreadable(path, answer), 0.0
-            else:
-                found, cpu_ms = answer.solution, answer.cpu_ms
-                lost = answer.stars if lost is None and found.status is Status.NOT_IDENTIFIED else lost
-            any_found |= found.ok
-            if not found.ok or found.remark:
-                complaints(path, found.remark or found.message)
-            output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
+    read, output = inputs.reader_of(args), console.Output(args, "field")
+    solving = inputs.identifying(args, args.frames, read, args.search_time)
+    answers = inputs.worked(args, partial(read.on, solving), args.frames)
+    for path, answer in zip(args.frames, answers, strict=True):
+        if isinstance(answer, FrameError):
+            unreadable, found, cpu_ms = True, Solution.unreadable(path, answer), 0.0
+        else:
+            found, cpu_ms = answer.solution, answer.cpu_ms
+            lost = answer.stars if lost is None and found.status is Status.NOT_IDENTIFIED else lost
+        any_found |= found.ok
+        if not found.ok or found.remark:
+            complaints(path, found.remark or found.message)
+        output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
     complaints.end()
     if lost is not None and not any_found:
-        console.complain(*solving.fitting(lost))
+        console.complain(solving.fitting(lost))
     return console.UNREADABLE if unreadable else 0 if any_found else 1
 
 

@@ -5,7 +5,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -25,11 +25,10 @@ from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.instrument import Instrument
 from starpos.night.opening import work_of
-from starpos.night.reading import About, First, Instruments, Reader, TiltFile
+from starpos.night.reading import Instruments, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
 from starpos.night.work import Solving
-from starpos.parallel.processes import Here, Workers, memory_bytes, processors, workers
-from starpos.progress import quiet
+from starpos.parallel.processes import Workers, memory_bytes, processors, workers
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ def reader_of(args: argparse.Namespace, by_files: bool = False) -> Reader:
     return Reader(clock, tuple(args.shutter_delay or (0.0, 0.0)))
 
 
-def given_of(args: argparse.Namespace, first: About | None) -> Instruments:
+def given_of(args: argparse.Namespace, first: Frame | Stars | None) -> Instruments:
     """The instrument of each frame; the focal length is from its header unless the options give one.
 
     Raises InstrumentError if the options do not fit together, or the first frame has no focal length either.
@@ -55,7 +54,7 @@ def given_of(args: argparse.Namespace, first: About | None) -> Instruments:
     )
 
 
-def given_or_sought(args: argparse.Namespace, first: About) -> Instruments:
+def given_or_sought(args: argparse.Namespace, first: Stars) -> Instruments:
     """Instruments as by `given_of`; where nothing states the focal length, it is sought by the stars of each lens."""
     if first.focal_px is not None or not is_untold(args):
         return given_of(args, first)
@@ -74,7 +73,7 @@ def seen_at(args: argparse.Namespace, place: Place) -> Iterator[tuple[Frame | St
     Frames without an attitude are complained about.  Raises StarposError as `solve` does.
     """
     read = reader_of(args)
-    about = First(read)(tuple(args.frames))
+    about = read.first(args.frames)
     if about is None:
         # says why
         read(args.frames[0])
@@ -103,11 +102,9 @@ def seen_at(args: argparse.Namespace, place: Place) -> Iterator[tuple[Frame | St
         yield item, sight, camera.scaled(answer.found.focal_scale * answer.at_place.focal_scale)
 
 
-def identifying(
-    args: argparse.Namespace, frames: Sequence[str], read: Reader, workers: Workers, search_s: float
-) -> Solving:
+def identifying(args: argparse.Namespace, frames: Sequence[str], read: Reader, search_s: float) -> Solving:
     """The work that identifies frames with the camera of the options, else of their headers, else of any scale."""
-    (about,) = workers.map([(First(read), tuple(frames))])
+    about = read.first(frames)
     given = Instruments(None, by_header=True)
     if about is not None and is_untold(args) and about.focal_px is None:
         BlindSolver(catalogue.load_catalogue(), console.ProgressBar()).prepare()
@@ -115,15 +112,13 @@ def identifying(
         given = given_of(args, about)
         prepare(options.instrument_of(args, about), about)
     # without a frame that can be read, each one reports why it cannot
-    # several at once would write over each other's progress
-    progress = console.ProgressBar() if isinstance(workers, Here) else quiet
-    return Solving(given, search_s=search_s, progress=progress)
+    return Solving(given, search_s=search_s, progress=console.ProgressBar())
 
 
 def checked_tilts(path: str, instrument: Instrument) -> TiltFile:
     """The table of tilts, with a complaint where its steps are coarse; raises TiltError, also for radians."""
     file = TiltFile(path, instrument.inclinometer.noise_rad)
-    console.complain(*of_tilts(file.log, path, instrument.inclinometer))
+    console.complain(of_tilts(file.log, path, instrument.inclinometer))
     return file
 
 
@@ -242,6 +237,18 @@ def workers_of(args: argparse.Namespace, paths: Sequence[str]) -> Workers:
     return workers(min(args.jobs or processors(), most))
 
 
+def worked(
+    args: argparse.Namespace,
+    work: Callable,
+    paths: Sequence[str],
+    what: str = "frame",
+    lines: bool = True,
+) -> Iterator:
+    """What a work makes of each file, in their order, by the workers of --jobs, as `watched`."""
+    with workers_of(args, paths) as workers:
+        yield from watched(workers.map((work, path) for path in paths), len(paths), what, lines)
+
+
 def watched(answers: Iterable, number: int, what: str = "frame", lines: bool = True) -> Iterator:
     """The answers unchanged, with a progress bar unless their lines on standard output show it on the same terminal."""
     bar = console.ProgressBar()
@@ -251,7 +258,7 @@ def watched(answers: Iterable, number: int, what: str = "frame", lines: bool = T
         yield answer
 
 
-def prepare(instrument: Instrument, about: About) -> None:
+def prepare(instrument: Instrument, about: Stars) -> None:
     """Put the tables of a field into the cache, for all processes of a machine; reports what the catalogue lacks."""
     solver = Solver(instrument, catalogue.load_catalogue(), progress=console.ProgressBar())
     # the frames report the error

@@ -4,12 +4,13 @@
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from starpos.cli import console, inputs, options
-from starpos.cli.fix_output import FIX_KEYS, HEAD
+from starpos.cli.fix_output import FIX_KEYS
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Geodetic, Vertical
 from starpos.errors import FixError, VoyageError
@@ -17,7 +18,6 @@ from starpos.instrument.instrument import framed
 from starpos.navigation.estimate import VoyageFix
 from starpos.navigation.voyage import Voyage
 from starpos.night import under_way
-from starpos.night.reading import First
 
 OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "bad input"
 # the keys of --json that come from a fix
@@ -30,37 +30,34 @@ KEYS: dict[str, Callable[[Any, Geodetic], Any]] = {
     **{key: FIX_KEYS[key] for key in ("latitude_geodetic", "longitude_geodetic", "covariance_geodetic")},
     **{key: FIX_KEYS[key] for key in ("xi_arcsec", "eta_arcsec", "deflection_stddev_arcsec")},
 }
-# of --csv
-COLUMNS = ("file", "status", *(k for k in KEYS if not k.startswith("covariance")))
 
 
 def run(args: argparse.Namespace) -> int:
     args.frames = inputs.frames_among(args.frames, args.imu, args.velocity)
-    vertical, read, number = options.vertical_of(args), inputs.reader_of(args), len(args.frames)
-    records = under_way.Records(
-        imu=args.imu,
-        imu_model=args.imu_model,
-        velocity=args.velocity,
-        vehicle=args.vehicle,
+    vertical, read = options.vertical_of(args), inputs.reader_of(args)
+    about = read.first(args.frames)
+    if about is None:
+        raise VoyageError(f"none of the {len(args.frames)} frames can be read: give star lists or frames")
+    instrument, axis = framed(options.instrument_of(args, about), about)
+    vessel, remark = under_way.vessel_of(
+        instrument,
+        options.atmosphere_of(args),
+        axis,
         mount_stddev_deg=args.mount_stddev,
-        drift_stddev=args.drift_stddev,
         height_m=args.altitude_m,
+        imu_model=args.imu_model,
+        vehicle=args.vehicle,
+        drift_stddev=args.drift_stddev,
     )
-    with inputs.workers_of(args, args.frames) as workers:
-        (about,) = workers.map([(First(read), tuple(args.frames))])
-        if about is None:
-            raise VoyageError(f"none of the {number} frames can be read: give star lists or frames")
-        instrument, axis = framed(options.instrument_of(args, about), about)
-        vessel, remark = records.vessel(instrument, options.atmosphere_of(args), axis)
-        console.complain(remark)
-        inputs.prepare(instrument, about)
-        work = under_way.IdentifyingVoyage(read, replace(inputs.given_of(args, about), instrument=instrument))
-        answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
-        frames = under_way.voyage_frames(answers)
+    console.complain(remark)
+    inputs.prepare(instrument, about)
+    given = replace(inputs.given_of(args, about), instrument=instrument)
+    work = partial(read.on, partial(under_way.voyage_frame, given))
+    frames = under_way.voyage_frames(inputs.worked(args, work, args.frames))
     for frame in frames:
         console.complain(frame.message)
     try:
-        voyage = records.voyage(frames, vessel, console.ProgressBar())
+        voyage = under_way.voyage_of(frames, args.imu, args.velocity, vessel, console.ProgressBar())
     except FixError as error:
         console.complain(error)
         return console.NOTHING
@@ -71,7 +68,7 @@ def tell(
     args: argparse.Namespace, frames: list[under_way.VoyageFrame], voyage: Voyage, vertical: Vertical
 ) -> int:
     """Write the answer for each frame; returns the exit status."""
-    output = console.Output(args, COLUMNS, HEAD)
+    output = console.Output(args, "voyage")
     console.complain(*voyage.faults)
     for path, frame, fix in zip(args.frames, frames, voyage.fixes, strict=True):
         status = _status(frame, fix)

@@ -18,7 +18,6 @@ from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument import instrument, instrument_file, platepar, sensors
 from starpos.instrument.camera import PLUMB_BOB, Camera
-from starpos.night.reading import About
 from starpos.sky.bodies import ERFA, JplKernel, SolarSystem
 
 
@@ -90,7 +89,7 @@ def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
     return Atmosphere.measured(pressure_pa, args.temperature_c, args.humidity, args.wavelength_um)
 
 
-def instrument_of(args: argparse.Namespace, first: About | Frame | Stars | None) -> instrument.Instrument:
+def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> instrument.Instrument:
     """The instrument from --instrument, or from --focal-mm and --pixel-um, or from the first frame's header.
 
     Raises InstrumentError if the options do not fit together or there is no focal length.
@@ -214,7 +213,7 @@ def place_of(args: argparse.Namespace, vertical: Vertical) -> Place | None:
         if args.altitude_m is not None:
             raise InstrumentError("--site has a height, and --altitude-m another: give one")
         vertical = replace(vertical, height_m=args.site[2])
-    covariance = np.eye(2) * (args.site_stddev or 0.0) ** 2
+    covariance = np.eye(2) * (getattr(args, "site_stddev", None) or 0.0) ** 2
     make = Place.on_ellipsoid if args.geodetic else Place.by_gravity
     latitude_deg, longitude_deg, *_ = args.site
     return make(latitude_deg, longitude_deg, vertical, covariance)

@@ -4,12 +4,14 @@
 import argparse
 import os
 import re
+import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from starpos import files
 from starpos.cli import console
-from starpos.errors import CatalogueError, InstrumentError
+from starpos.errors import CatalogueError, InstrumentError, WriteError
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
@@ -72,10 +74,30 @@ def never(path: Path) -> None:
     raise InstrumentError(f"{path}: it is there already, and may hold more than starpos writes")
 
 
-def picture(path: Path) -> None:
-    """The check of a picture: a PNG names the program that made it."""
-    if not (path.is_file() and path.suffix.lower() == ".png" and files.has_mark(path)):
-        raise _there(path, "not a picture made by starpos")
+def ours(path: Path) -> None:
+    """The check of a page, a picture or a file of places, which names the program that made it."""
+    if not (path.is_file() and files.has_mark(path)):
+        raise _there(path, "not of starpos")
+
+
+def check_folder(folder: Path) -> None:
+    """Raise WriteError, before a night is worked on, where its report could not be written; leaves nothing behind."""
+    made: list[Path] = []
+    try:
+        made = [path for path in (folder, *folder.parents) if not path.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    # ValueError: the name contains a NUL
+    except (OSError, ValueError) as e:
+        reason = getattr(e, "strerror", None) or e
+        raise WriteError(
+            f"{folder}: the report cannot be written there ({reason}): give another --out"
+        ) from None
+    finally:
+        for path in made:
+            with suppress(OSError):
+                path.rmdir()
 
 
 def stars(path: Path) -> None:

@@ -4,16 +4,13 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from pathlib import Path
 
 import numpy as np
 
 from starpos import __version__
-from starpos.cli.console import plain
-from starpos.cli.fix_output import COLUMNS
+from starpos.cli.console import columns_of, plain
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.errors import InstrumentError
-from starpos.files import has_mark, save
+from starpos.files import save
 from starpos.report.coast import SIGMAS_95
 
 GPX = ".gpx"
@@ -27,12 +24,6 @@ NUMBERS = ("latitude_geodetic", "longitude_geodetic")
 def is_places(path: str) -> bool:
     """Whether a name has the suffix of such a file."""
     return path.lower().endswith(SUFFIXES)
-
-
-def check_ours(path: Path) -> None:
-    """Raise InstrumentError unless an existing file is one that starpos wrote."""
-    if not has_mark(path):
-        raise InstrumentError(f"{path}: it is there already and not of starpos")
 
 
 def feature_collection(features: Iterable[tuple[str, Sequence, Mapping]]) -> dict:
@@ -65,7 +56,7 @@ def _geojson(found: Sequence[Mapping]) -> dict:
     features = []
     for answer in found:
         latitude, longitude = (answer[name] for name in NUMBERS)
-        about = {k: answer.get(k) for k in COLUMNS if k not in NUMBERS}
+        about = {k: answer.get(k) for k in columns_of("fix") if k not in NUMBERS}
         features.append(("Point", [longitude, latitude], about))
         if answer.get("combined"):
             features.append(("Polygon", [_ellipse(answer)], {"name": "95 %"}))

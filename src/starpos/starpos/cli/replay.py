@@ -6,8 +6,8 @@ import argparse
 from starpos.cli import console, fix_output, inputs
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError
-from starpos.fix.checks import BY_PARAMETERS, MODEL_BY_PARAMETERS
-from starpos.night.remarks import of_a3, of_extrapolation, of_inclinometer
+from starpos.fix.checks import BY_PARAMETERS, MODEL_BY_PARAMETERS, unknown_a3, unnamed_inclinometer
+from starpos.night.remarks import of_extrapolation
 from starpos.night.together import FrameAnswer, Gathered
 from starpos.recording.drivers import Drivers
 from starpos.recording.topics import remaps_of
@@ -18,16 +18,15 @@ from starpos.units import utc_text
 
 def run(args: argparse.Namespace) -> int:
     settings = Settings.of(args.params_file, args.param, args.namespace)
-    output = console.Output(args, fix_output.COLUMNS, fix_output.HEAD)
+    output = console.Output(args, "fix")
     # a wrong parameter is reported once, not for each bag
     Drivers.of(args.params_file, args.param, args.namespace)
     work = Playing(args.params_file, tuple(args.param), args.namespace, remaps_of(args.remap))
-    with inputs.workers_of(args, args.bags) as workers:
-        answers = inputs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
-        return max(
-            tell(args, output, bag, night, settings.vertical)
-            for bag, night in zip(args.bags, answers, strict=True)
-        )
+    answers = inputs.worked(args, work, args.bags, "bag")
+    return max(
+        tell(args, output, bag, night, settings.vertical)
+        for bag, night in zip(args.bags, answers, strict=True)
+    )
 
 
 def tell(
@@ -54,12 +53,13 @@ def tell(
             fix_output.line_of(f"{bag} {time}", solution, turning=False),
         )
     whole, solved = night.average, gathered.solved
-    remarks = list(of_extrapolation(solved))
+    remarks = [of_extrapolation(solved)]
     if solved:
-        remarks += of_inclinometer(night.instrument, MODEL_BY_PARAMETERS)
+        remarks.append(unnamed_inclinometer(night.instrument, MODEL_BY_PARAMETERS))
     if whole:
-        remarks += of_a3(night.instrument.calibration, whole, BY_PARAMETERS)
-    for remark in remarks:
+        calibration = night.instrument.calibration
+        remarks.append(unknown_a3(calibration, whole.covariance, whole.terms, BY_PARAMETERS))
+    for remark in filter(None, remarks):
         console.complain(f"{bag}: {remark}")
     if solved:
         fix_output.put_combined(output, bag if len(args.bags) > 1 else None, whole, gathered, vertical)

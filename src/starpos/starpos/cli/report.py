@@ -8,19 +8,21 @@ from pathlib import Path
 
 from starpos.cli import console, inputs, options, overwriting, places_file
 from starpos.cli.fix_output import json_of
-from starpos.cli.solve import read_receiver
+from starpos.cli.solve import how_of
 from starpos.errors import FrameError, InstrumentError
+from starpos.files import save
 from starpos.frames.reading import are_photographs
 from starpos.night.night import Night
 from starpos.night.opening import exposures, frames_in
-from starpos.night.reading import First, Instruments
-from starpos.night.solving import Exposures, How, solved_night
+from starpos.night.reading import Instruments
+from starpos.night.solving import Exposures, solved_night
 from starpos.parameters.given import of_solver
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
 # endings of a page in one file
 PAGES = (".html", ".htm")
+INDEX = "index.html"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -37,13 +39,13 @@ def run(args: argparse.Namespace) -> int:
         return _write_places(args)
     if find_spec("matplotlib") is None:
         raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {inputs.PIP}")
-    from starpos.report.html import PAGE, check_folder, write_files
     from starpos.report.page import nights_picture, page, pictures_of
     from starpos.report.photograph import named_photograph
 
     out = Path(args.out)
-    folder, index = (out.parent, out.name) if out.suffix.lower() in PAGES else (out, PAGE)
-    check_folder(folder, index)
+    folder, index = (out.parent, out.name) if out.suffix.lower() in PAGES else (out, INDEX)
+    overwriting.check(argparse.Namespace(out=folder / index), out=overwriting.ours)
+    overwriting.check_folder(folder)
     groups = _groups(args.nights)
     nights = _nights(groups, args)
     bar, each = console.ProgressBar(), []
@@ -60,7 +62,11 @@ def run(args: argparse.Namespace) -> int:
         prefix = f"night{k}-" if len(nights) > 1 else ""
         files |= {f"{prefix}{p.name}.png": p.png for p in pictures}
     # the page has its pictures
-    write_files(folder, ({} if folder != out else files) | {index: html.encode(errors="replace")})
+    files = ({} if folder != out else files) | {index: html.encode(errors="replace")}
+    for name in files:
+        overwriting.check(argparse.Namespace(out=folder / name), out=overwriting.ours)
+    for name, content in files.items():
+        save(folder / name, content, "the report")
     print(folder / index)
     return 0 if any(n.combined for n in nights) else console.NOTHING
 
@@ -82,7 +88,7 @@ def _nights(groups: list[list[Path]], args: argparse.Namespace) -> list[Night]:
 
 def _write_places(args: argparse.Namespace) -> int:
     """Write the places of nights for maps, without a page."""
-    overwriting.check(args, out=places_file.check_ours)
+    overwriting.check(args, out=overwriting.ours)
     answers: list[dict] = []
     for night in _nights(_groups(args.nights), args):
         answers += [{"file": s.name} | json_of(s.place, night.vertical) for _, s in night.fixed]
@@ -111,8 +117,7 @@ def _pack(args: argparse.Namespace) -> int:
 
 def _night(paths: list[Path], args: argparse.Namespace) -> Night:
     """The Night of a folder, a bag or photographs; raises StarposError if there is nothing to work on."""
-    receiver = read_receiver(args.gnss, None)
-    how = How(options.turn_of(args) if args.self_calibrate else None, receiver)
+    how = how_of(args)
     return solved_night(_exposures(paths, args), how, console.ProgressBar())
 
 
@@ -133,7 +138,7 @@ def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
             f"{path}: neither a folder of frames nor a rosbag2 (.mcap, .db3), nor a photograph: give one of these"
         )
     read, folder = inputs.reader_of(args), path.parent if frames else path
-    about = First(read)(tuple(map(str, frames or frames_in(path))))
+    about = read.first(list(map(str, frames or frames_in(path))))
     # a field report states the focal length
     find = inputs.given_or_sought if args.field is None else inputs.given_of
     given = Instruments(None) if about is None else find(args, about)

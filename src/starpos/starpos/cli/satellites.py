@@ -6,7 +6,8 @@ import json
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from starpos.fix.searching import Sight
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.gnss.receiver import gnss_place, read_gnss_csv
-from starpos.night.work import OnFile, TrailSighted
+from starpos.night.work import trails_seen
 from starpos.satellites.adjustment import KnownBefore
 from starpos.satellites.elements import Orbit, chosen, read_orbits
 from starpos.satellites.locating import SatelliteFix, locate
@@ -40,26 +41,14 @@ TABLES = ".csv", ".iod", ".txt"
 MOST_JSON_BYTES = 300_000_000
 
 
-@dataclass
-class SeenTrails:
-    """What the files of a call show: trails, and the frames that were identified, by their names."""
-
-    trails: list[SatelliteTrail] = field(default_factory=list)
-    frames: dict[str, Sight] = field(default_factory=dict)
-
-
 def run(args: argparse.Namespace) -> int:
     if args.plan is not None:
         return plan(args)
     if not args.sightings or not args.elements:
         raise SatelliteError("give frames or sightings and --elements, or --plan LAT LON")
-    seen = SeenTrails()
     frames = [path for path in args.sightings if Path(path).suffix.lower() not in TABLES]
-    for path in args.sightings:
-        seen.trails += [] if path in frames else _read(path)
-    if frames:
-        _look(args, frames, seen)
-    trails = seen.trails
+    trails = [trail for path in args.sightings if path not in frames for trail in _read(path)]
+    sights = _look(args, frames, trails) if frames else {}
     if not trails:
         return _refused(args, f"none of {len(frames)} frames shows an end of a trail: give more frames")
     begin = float(min(t.utc_unix_s.min() for t in trails))
@@ -73,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     for k, trail in enumerate(trails):
         value = trail_json(trail, fix, k)
         console.tell(args, value, trail_line(value))
-    headings = [h for name, sight in seen.frames.items() if (h := heading_json(name, sight, fix)) is not None]
+    headings = [h for name, sight in sights.items() if (h := heading_json(name, sight, fix)) is not None]
     lines = [f"{h['file']}: heading {h['heading']:.4f} +- {h['sigma_heading_deg']:.4f} deg" for h in headings]
     console.tell(
         args, {"combined": True} | fix_json(fix) | {"frames": headings}, "\n".join([*lines, fix.text])
@@ -107,26 +96,24 @@ def _read(path: str) -> list[SatelliteTrail]:
     return trails
 
 
-def _look(args: argparse.Namespace, frames: list[str], seen: SeenTrails) -> None:
-    """Add the frames and their trails, numbered on; complains of frames without, and of trails that are left out."""
-    number = 1 + max((trail.track for trail in seen.trails), default=-1)
+def _look(args: argparse.Namespace, frames: list[str], trails: list[SatelliteTrail]) -> dict[str, Sight]:
+    """The frames that were identified, by name; their trails are added, numbered on, and what is left out is said."""
+    number, sights = 1 + max((trail.track for trail in trails), default=-1), {}
     complaints, read = console.FrameComplaints(), inputs.reader_of(args)
-    with inputs.workers_of(args, frames) as workers:
-        solving = inputs.identifying(args, frames, read, workers, SEARCH_S)
-        work = OnFile(read, TrailSighted(solving))
-        answers = inputs.watched(workers.map((work, path) for path in frames), len(frames))
-        for path, answer in zip(frames, answers, strict=True):
-            if isinstance(answer, FrameError):
-                complaints(path, str(answer))
-            elif isinstance(answer, Solution):
-                complaints(path, answer.message)
-            else:
-                seen.frames[path], found = answer
-                if found.left_out:
-                    complaints(path, found.left_out)
-                seen.trails += [replace(t, track=number + k, file=path) for k, t in enumerate(found.trails)]
-                number += len(found.trails)
+    work = partial(read.on, partial(trails_seen, inputs.identifying(args, frames, read, SEARCH_S)))
+    for path, answer in zip(frames, inputs.worked(args, work, frames), strict=True):
+        if isinstance(answer, FrameError):
+            complaints(path, str(answer))
+        elif isinstance(answer, Solution):
+            complaints(path, answer.message)
+        else:
+            sights[path], found = answer
+            if found.left_out:
+                complaints(path, found.left_out)
+            trails += [replace(t, track=number + k, file=path) for k, t in enumerate(found.trails)]
+            number += len(found.trails)
     complaints.end()
+    return sights
 
 
 def _prior(args: argparse.Namespace, utc_unix_s: float) -> KnownBefore:

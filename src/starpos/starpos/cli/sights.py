@@ -5,13 +5,13 @@ import argparse
 
 from starpos.averaging.sights import circle_of_sight, place_of_sights, read_sights
 from starpos.cli import console, options
-from starpos.cli.fix_output import COLUMNS, ELEVATIONS_HEAD, put_combined, put_elevation
+from starpos.cli.fix_output import tell_elevations
 from starpos.cli.inputs import near_of
 from starpos.errors import InstrumentError, StarposError
-from starpos.fix.solution import Status
+from starpos.fix.circle import Circle
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
 from starpos.night.remarks import doubts, of_average
-from starpos.night.together import Gathered
+from starpos.night.together import Together
 from starpos.sky.catalogue import load_catalogue
 
 
@@ -23,26 +23,20 @@ def run(args: argparse.Namespace) -> int:
     clock_s = UNKNOWN_CLOCK_S if args.clock_stddev is None else args.clock_stddev
     catalogue, air = load_catalogue(), options.atmosphere_of(args)
     ephemeris = options.ephemeris_of(args)
-    output, used, circles = console.Output(args, COLUMNS, ELEVATIONS_HEAD), [], []
+    output = console.Output(args, "elevations")
+    circles: list[Circle | StarposError] = []
     for sight in sights:
         try:
-            circle = circle_of_sight(sight, catalogue, air, clock_s, ephemeris)
+            circles.append(circle_of_sight(sight, catalogue, air, clock_s, ephemeris))
         except StarposError as error:
-            console.complain(error)
-            put_elevation(output, sight.source, sight.utc_unix_s, None, vertical, Status.BAD_INPUT.value)
-            continue
-        used.append(sight)
-        circles.append(circle)
-        put_elevation(output, sight.source, sight.utc_unix_s, circle.zenith_distance, vertical)
-    if not circles:
-        return console.NOTHING
-    place, about = None, {}
-    try:
-        place = place_of_sights(used, circles, None if near is None else (near.latitude, near.longitude))
-    except StarposError as error:
-        console.complain(error)
-    else:
-        console.complain(*of_average(place), *doubts((), place, None, near))
-        about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
-    put_combined(output, None, place, Gathered(), vertical, about)
-    return console.NOTHING if place is None else 0
+            circles.append(error)
+    whole = Together()
+    sound = [(s, c) for s, c in zip(sights, circles, strict=True) if isinstance(c, Circle)]
+    if sound:
+        try:
+            used, seen = zip(*sound, strict=True)
+            place = place_of_sights(used, seen, None if near is None else (near.latitude, near.longitude))
+            whole = Together(place, "", (*of_average(place), *doubts((), place, None, near)))
+        except StarposError as error:
+            whole = Together(None, str(error))
+    return tell_elevations(args, output, sights, circles, whole, vertical, near)

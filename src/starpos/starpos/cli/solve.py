@@ -5,6 +5,7 @@ import argparse
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,8 +17,10 @@ from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import InstrumentError, StarposError, TiltError
 from starpos.fix.blind import BlindSolver
-from starpos.fix.solution import Solution, status_of
+from starpos.fix.checks import unnamed_inclinometer
+from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
+from starpos.frames.frame import Stars
 from starpos.frames.reading import are_photographs
 from starpos.frames.tables import Pointing, read_pointings
 from starpos.instrument import instrument_file
@@ -26,17 +29,16 @@ from starpos.instrument.phone_log import is_phone_log
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night import field
 from starpos.night.opening import work_of
-from starpos.night.reading import NO_CAMERA, About, First, Instruments
-from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, of_inclinometer
+from starpos.night.reading import NO_CAMERA, Instruments
+from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near
 from starpos.night.solving import How, NightAnswers, answers_of
 from starpos.night.together import FrameAnswer, Gathered, TurnedNight, from_elevations, together, turned
-from starpos.night.work import OnFile, Solving
+from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
 if TYPE_CHECKING:
     from starpos.gnss.states import Learned
-    from starpos.night.beside_gnss import Receiver
 
 
 def tell(
@@ -71,14 +73,13 @@ def tell(
     complaints.end()
     fixes, headings, near = gathered.fixes, gathered.headings, inputs.near_of(args)
     whole = together(gathered, answers.given, near)
-    mean, why = (None, ()) if place is None else fix_output.mean_of(headings)
-    unnamed = () if watched is None or answers.instrument is None else of_inclinometer(answers.instrument)
-    not_averaged = [whole.why_not] if whole.why_not else []
-    say(folder, *not_averaged, *(unnamed if fixes else ()), *whole.remarks, *why)
-    where, about = whole.average or (fixes[-1] if fixes else None), {}
-    if where is not None:
-        options.tell_unknown(args, vertical.at(where.latitude, where.longitude))
-        about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
+    mean, why = (None, "") if place is None else fix_output.mean_of(headings)
+    unnamed = ""
+    if fixes and watched is not None and answers.instrument is not None:
+        unnamed = unnamed_inclinometer(answers.instrument)
+    say(folder, whole.why_not, unnamed, *whole.remarks, why)
+    where = whole.average or (fixes[-1] if fixes else None)
+    about = fix_output.about_average(args, where, vertical, near)
     if place is not None:
         about |= fix_output.with_heading(
             fix_output.json_of(whole.average, vertical), mean, place, options.axes_of(args)
@@ -86,7 +87,7 @@ def tell(
     if where is not None or (headings and place is not None):
         fix_output.put_combined(output, folder, whole.average, gathered, vertical, about, mean)
     elif gathered.lost is not None and not headings and work is not None:
-        say(folder, *work.fitting(gathered.lost))
+        say(folder, work.fitting(gathered.lost))
     # without tilts headings are all that was asked for, and by day they are all there is
     by_day = any(s.bodies for s in headings)
     found = bool(headings) if place is not None and (by_day or not args.tilt) else whole.average is not None
@@ -143,22 +144,22 @@ def tell_turned(args: argparse.Namespace, folder: str | None, turned: TurnedNigh
 
 def say(folder: str | None, *texts: object) -> None:
     """Print lines about a whole night on standard error."""
-    for text in texts:
+    for text in filter(None, texts):
         console.complain(text if folder is None else f"{folder}: {text}")
 
 
-def read_receiver(gnss: str | None, learned: str | None) -> "Receiver | None":
-    """Read the tables of --gnss and --learned; None without the first.  Raises StarposError."""
-    if gnss is None:
-        return None
+def how_of(args: argparse.Namespace) -> How:
+    """How a night is solved, with the tables of --gnss and --learned; raises StarposError."""
+    turn_deg = options.turn_of(args) if args.self_calibrate else None
+    if args.gnss is None:
+        return How(turn_deg)
     from starpos.gnss import states
     from starpos.gnss.receiver import read_gnss_csv
-    from starpos.night.beside_gnss import Receiver
 
-    track, faults = read_gnss_csv(gnss)
+    track, faults = read_gnss_csv(args.gnss)
     console.complain(*faults)
-    before = None if learned is None else states.read_learned(Path(learned))
-    return Receiver(track, before)
+    learned = getattr(args, "learned", None)
+    return How(turn_deg, track, None if learned is None else states.read_learned(Path(learned)))
 
 
 def _save_learned(path: Path, learned: "Learned | None") -> None:
@@ -194,9 +195,7 @@ def run_pointings(args: argparse.Namespace) -> int:
     check_save(args, solver.instrument)
     tilts = NO_TILTS if own_level else inputs.checked_tilts(args.tilt, solver.instrument)
     whole = [p for p in pointings if p.has_roll]
-    output = console.Output(
-        args, fix_output.COLUMNS, fix_output.HEAD if whole else fix_output.ELEVATIONS_HEAD
-    )
+    output = console.Output(args, "fix" if whole else "elevations")
     if not whole:
         return _from_elevations(args, output, solver, tilts, pointings, vertical, near)
     found, given = None, solver.instrument if not args.self_calibrate else None
@@ -219,30 +218,17 @@ def _from_elevations(
     near: Near | None,
 ) -> int:
     """Print each row's zenith distance and the place that they give together; returns the exit status."""
-    found = from_elevations(solver, pointings, tilts, near, args.self_calibrate)
-    for p, circle in zip(pointings, found.circles, strict=True):
-        if isinstance(circle, StarposError):
-            console.complain(circle)
-            status = status_of(p, circle).value
-            fix_output.put_elevation(output, p.source, p.mid_unix_s, None, vertical, status)
-        else:
-            fix_output.put_elevation(output, p.source, p.mid_unix_s, circle.zenith_distance, vertical)
-    whole, saving = found.together, 0
+    found, saving = from_elevations(solver, pointings, tilts, near, args.self_calibrate), 0
+    status = fix_output.tell_elevations(
+        args, output, pointings, found.circles, found.together, vertical, near
+    )
     if found.axis is not None:
-        say(
-            None,
-            f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec",
+        console.complain(
+            f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec"
         )
     if args.save is not None:
         saving = _save_axis(args, solver, found.axis)
-    say(None, *([whole.why_not] if whole.why_not else ()), *whole.remarks)
-    place, about = whole.average, {}
-    if place is not None:
-        options.tell_unknown(args, vertical.at(place.latitude, place.longitude))
-        about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
-    if place is not None or whole.why_not:
-        fix_output.put_combined(output, None, place, Gathered(), vertical, about)
-    return max(saving, 0 if place else console.NOTHING)
+    return max(saving, status)
 
 
 def _save_axis(args: argparse.Namespace, solver: Solver, axis: FoundAxis | None) -> int:
@@ -281,30 +267,22 @@ def _run(args: argparse.Namespace) -> int:
     options.check_frames(args)
     if args.out is not None and not places_file.is_places(args.out):
         raise InstrumentError(f"-o {args.out}: give a name that ends in {' or '.join(places_file.SUFFIXES)}")
-    overwriting.check(args, save=instrument_file.check_replaceable, out=places_file.check_ours)
+    overwriting.check(args, save=instrument_file.check_replaceable, out=overwriting.ours)
     if args.pointings is not None:
         return run_pointings(args)
     vertical = options.vertical_of(args)
     place = options.place_of(args, vertical)
-    output = console.Output(
-        args,
-        *(
-            (fix_output.COLUMNS, fix_output.HEAD)
-            if place is None
-            else (fix_output.HEADING_COLUMNS, fix_output.HEADING_HEAD)
-        ),
-    )
+    output = console.Output(args, "fix" if place is None else "heading")
     inputs.near_of(args)
     own_level = options.has_own_level(args)
-    receiver = read_receiver(args.gnss, args.learned)
-    if receiver is not None and own_level:
+    how = how_of(args)
+    if args.gnss is not None and own_level:
         raise InstrumentError(
             "--gnss teaches an inclinometer, and this camera is its own level: leave --gnss out"
         )
-    how = How(options.turn_of(args) if args.self_calibrate else None, receiver)
     # the folder of a night has its tilts
     needs_no_tilt = own_level or (
-        (place is not None or receiver is not None) and not any(map(os.path.isdir, args.frames))
+        (place is not None or args.gnss is not None) and not any(map(os.path.isdir, args.frames))
     )
     given = inputs.nights_of(inputs.frames_among(args.frames, args.tilt, args.gnss), args.tilt, needs_no_tilt)
     if args.save is not None and len(given) > 1:
@@ -316,13 +294,13 @@ def _run(args: argparse.Namespace) -> int:
     statuses = [_refused(why, given) for why in given if not isinstance(why, inputs.NightFolder)]
     with inputs.workers_of(args, [path for night in nights for path in night.frames]) as workers:
         plans = []
-        abouts = workers.map((First(read, by_gravity), night.frames) for night in nights)
+        abouts = workers.map((partial(read.first, levelled=by_gravity), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):
             try:
                 plans.append((night, _work(args, night, about, own_level, place, by_gravity)))
             except TiltError as error:
                 statuses.append(_refused(error, given))
-        on_files = [OnFile(read, how.work(work)) for _, work in plans]
+        on_files = [partial(read.on, how.work(work)) for _, work in plans]
         calls = [(f, path) for f, (night, _) in zip(on_files, plans, strict=True) for path in night.frames]
         # the lines of a turn come at its end, and show no progress
         sights = inputs.watched(workers.map(calls), len(calls), lines=how.one_by_one)
@@ -347,7 +325,7 @@ def _refused(why: StarposError, given: list) -> int:
 def _work(
     args: argparse.Namespace,
     night: inputs.NightFolder,
-    about: About | None,
+    about: Stars | None,
     own_level: bool,
     place: Place | None,
     by_gravity: bool,

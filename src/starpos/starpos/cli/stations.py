@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     values = [station_json(station, grid) for station in stations]
     if grid is not None and (without := [v["station"] for v in values if v["grid_arcsec"] is None]):
         console.complain(f"{args.geoid}: no data at {', '.join(without)}")
-    output = console.Output(args, tuple(flat(values[0])), "")
+    output = console.Output(args, "stations")
     if args.geojson:
         console.print_json(_geojson(values))
     else:

@@ -8,27 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from starpos.cli.console import OUTPUTS, values
 from starpos.files import save
 from starpos.night.watching import Kept
+from starpos.parameters.table import rows_of
 from starpos.report.html import document, wide_table
 from starpos.units import ARCSEC, utc_text
 
-# key: heading of its column on the page, and format
-COLUMNS = {
-    "night": ("night", "{}"),
-    "utc": ("mean time", "{}"),
-    "frames": ("frames", "{}"),
-    "stars": ("stars", "{}"),
-    "moved_arcsec": ("moved, arcsec", "{:.1f}"),
-    "sigma_arcsec": ("1 sigma", "{:.1f}"),
-    "focal_px": ("focal length, px", "{:.3f}"),
-    "limit_mag": ("limit, V", "{:.1f}"),
-    "worst_limit_mag": ("worst frame", "{:.1f}"),
-    "extinction": ("extinction, mag per air mass", "{:.2f}"),
-    "extinction_sigma": ("1 sigma", "{:.2f}"),
-    "sky_mag": ("sky, V per square arcsec", "{:.2f}"),
-    "alarm": ("", "{}"),
-}
 TITLE = "A camera that stands still"
 # a limit that is brighter by more is said in a sentence
 DIMMED_MAG = 1.0
@@ -39,35 +25,27 @@ WIDTH, HEIGHT = 800, 120
 def values_of(night: Kept) -> dict:
     """A night for --json."""
     pose = night.pose
-    return {
-        "night": pose.day,
-        "utc": utc_text(pose.utc_unix_s),
-        "frames": pose.frames,
-        "stars": pose.stars,
-        "moved_arcsec": night.moved_arcsec,
-        "sigma_arcsec": night.sigma_arcsec,
-        "turned_arcsec": (night.turned / ARCSEC).tolist(),
-        "focal_px": pose.focal_px,
-        "limit_mag": pose.limit_mag,
-        "worst_limit_mag": pose.worst_limit_mag,
-        "extinction": pose.extinction,
-        "extinction_sigma": pose.extinction_sigma,
-        "sky_mag": pose.sky_mag,
-        "alarm": night.alarm,
-    }
+    return (
+        {"night": pose.day, "utc": utc_text(pose.utc_unix_s)}
+        | values(pose, "frames stars")
+        | values(night, "moved_arcsec sigma_arcsec")
+        | {"turned_arcsec": night.turned / ARCSEC}
+        | values(pose, "focal_px limit_mag worst_limit_mag extinction extinction_sigma sky_mag")
+        | values(night, "alarm")
+    )
 
 
-def line_of(values: dict) -> str:
+def line_of(night: dict) -> str:
     """Text of a night for people."""
-    sky = "" if math.isnan(values["sky_mag"]) else ", sky V {sky_mag:.2f} per square arcsec"
-    known = not math.isnan(values["extinction"])
+    sky = "" if math.isnan(night["sky_mag"]) else ", sky V {sky_mag:.2f} per square arcsec"
+    known = not math.isnan(night["extinction"])
     air = ", extinction " + (
         "{extinction:.2f} +- {extinction_sigma:.2f} mag per air mass" if known else "unknown"
     )
     return (
         "{night}: {frames} frames, {stars} stars, moved by {moved_arcsec:.1f} +- {sigma_arcsec:.1f} arcsec, focal length "
         "{focal_px:.3f} px, limit V {limit_mag:.1f} (worst frame {worst_limit_mag:.1f})" + air + sky
-    ).format(**values)
+    ).format(**night)
 
 
 def alarm_of(night: Kept) -> str:
@@ -91,7 +69,7 @@ def dimmed_of(nights: Sequence[Kept]) -> str:
 
 def write_page(path: Path, nights: Sequence[Kept]) -> None:
     """Write the history as a page; raises WriteError if it cannot be written."""
-    rows = [values_of(n) for n in nights]
+    rows, columns = [values_of(n) for n in nights], rows_of(OUTPUTS)["watch"]
     most = max([1.0, *(r["moved_arcsec"] for r in rows)])
     step = WIDTH / max(len(rows), 1)
     bars = "".join(
@@ -102,7 +80,7 @@ def write_page(path: Path, nights: Sequence[Kept]) -> None:
     cells = [
         [
             escape(("moved" if r[k] else "") if k == "alarm" else form.format(r[k]).replace("nan", "unknown"))
-            for k, (_, form) in COLUMNS.items()
+            for k, (_, form) in columns.items()
         ]
         for r in rows
     ]
@@ -113,6 +91,6 @@ def write_page(path: Path, nights: Sequence[Kept]) -> None:
     parts = (
         f"<h1>{TITLE}</h1><p>{about}</p>",
         f'<svg width="{WIDTH}" height="{HEIGHT}">{bars}</svg>',
-        wide_table([name for name, _ in COLUMNS.values()], cells),
+        wide_table([name for name, _ in columns.values()], cells),
     )
     save(path, document(TITLE, parts).encode(), "the page")

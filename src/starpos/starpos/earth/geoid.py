@@ -11,7 +11,7 @@ import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -22,9 +22,6 @@ from starpos.files import bytes_of, open_regular
 from starpos.frames.pictures import BITS, HEIGHT, SAMPLES, WIDTH, decode_picture
 from starpos.frames.tiff import TIFF_ORDERS, tiff_directory
 from starpos.units import ARCSEC
-
-if TYPE_CHECKING:
-    from scipy.interpolate import RectBivariateSpline
 
 PIXEL_SCALE, TIEPOINT, GEO_KEYS = 33550, 33922, 34735
 GDAL_METADATA, GDAL_NODATA = 42112, 42113
@@ -50,7 +47,7 @@ def read_geotiff(data: bytes, most_bytes: int) -> tuple[np.ndarray, float, float
     if _number(tags, SAMPLES, 1) != 1:
         raise GeoidError(f"it has {_number(tags, SAMPLES, 1)} bands: one, of undulations, is wanted")
     south, west, step_latitude, step_longitude = _corner(tags, height)
-    scale, offset = _metadata(tags)
+    _check_metadata(tags)
     values = decode_picture(data)
     if values is None or values.shape != (height, width):
         raise GeoidError("its pixels cannot be decoded: copy it again")
@@ -59,8 +56,6 @@ def read_geotiff(data: bytes, most_bytes: int) -> tuple[np.ndarray, float, float
     nodata = _nodata(tags)
     if nodata is not None:
         values[values == values.dtype.type(nodata)] = np.nan
-    if (scale, offset) != (1.0, 0.0):
-        values = values * values.dtype.type(scale) + values.dtype.type(offset)
     return values.astype(np.float32, copy=False)[::-1], south, west, step_latitude, step_longitude
 
 
@@ -105,8 +100,8 @@ def _corner(tags: dict, height: int) -> tuple[float, float, float, float]:
     return north - (height - 1 + centre - row) * scale[1], west, scale[1], scale[0]
 
 
-def _metadata(tags: dict) -> tuple[float, float]:
-    """Scale and offset of the values; GeoidError if the metadata say that they are not undulations."""
+def _check_metadata(tags: dict) -> None:
+    """GeoidError if the metadata say that the values are not undulations in m."""
     text = _text(tags, GDAL_METADATA)
     items = dict(re.findall(r'<Item name="(\w+)"[^>]*>([^<]*)</Item>', text))
     kind = items.get("TYPE", "VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL")
@@ -115,13 +110,10 @@ def _metadata(tags: dict) -> tuple[float, float]:
     # of the same type are heights of a tidal surface (hydroid_height), which is not level
     if (band := items.get("DESCRIPTION", UNDULATION).strip()) != UNDULATION:
         raise GeoidError(f"its band is {band[:60]!r}: one of {UNDULATION} is wanted")
-    try:
-        scale, offset = float(items.get("SCALE", 1)), float(items.get("OFFSET", 0))
-    except ValueError:
-        raise GeoidError("the SCALE or OFFSET in its metadata is no number") from None
-    if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
-        raise GeoidError(f"its metadata claim a scale of {scale:g} and an offset of {offset:g}")
-    return scale, offset
+    if items.get("SCALE", "1") != "1" or items.get("OFFSET", "0") != "0":
+        raise GeoidError(
+            "its values have a SCALE or an OFFSET: gdal_translate -unscale -ot Float32 applies them"
+        )
 
 
 def _nodata(tags: dict) -> float | None:
@@ -284,17 +276,7 @@ class Geoid:
         return Deflection(xi, eta, stddev)
 
     def _slopes(self, phi: float, lam: float) -> tuple[float, float]:
-        """Components xi and eta in arcsec; NaN without data."""
-        spline, row, column, north_m, east_m = self._spline(phi, lam)
-        if spline is None:
-            return math.nan, math.nan
-        xi, eta = -spline(row, column, dx=1) / north_m, -spline(row, column, dy=1) / east_m
-        return float(xi.item() / ARCSEC), float(eta.item() / ARCSEC)
-
-    def _spline(
-        self, phi: float, lam: float
-    ) -> "tuple[RectBivariateSpline | None, float, float, float, float]":
-        """Spline of undulations (m) around a place, None without data; its row and column there; m for one of each."""
+        """Components xi and eta in arcsec, by a spline of the undulations around a place; NaN without data."""
         # slow to import, and only needed with a grid
         from scipy.interpolate import RectBivariateSpline
 
@@ -303,8 +285,10 @@ class Geoid:
             nodes, row, column = self._window(phi, lam, reach, reach, stride)
             if np.isfinite(nodes).all():
                 at = np.arange(2 * reach)
-                return RectBivariateSpline(at, at, nodes), row, column, north_m, east_m
-        return None, math.nan, math.nan, north_m, east_m
+                spline = RectBivariateSpline(at, at, nodes)
+                xi, eta = -spline(row, column, dx=1) / north_m, -spline(row, column, dy=1) / east_m
+                return float(xi.item() / ARCSEC), float(eta.item() / ARCSEC)
+        return math.nan, math.nan
 
     def _roughness(self, phi: float, lam: float) -> float:
         """Root mean square change of the slope from node to node around a place, arcsec; NaN without data."""

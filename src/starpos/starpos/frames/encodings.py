@@ -7,18 +7,18 @@ packed pixels (Pixel Format Naming Convention: `Mono12p`; GigE Vision: `Mono12Pa
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from starpos.errors import FrameError
 from starpos.frames.frame import PATTERNS
 from starpos.frames.pictures import frame_pixels
-from starpos.frozen import at_once
 
 MOSAICS = tuple(filter(None, PATTERNS))
+COLOURS = ("rgb", "rgba", "bgra")
 
 
-@at_once
 @dataclass(frozen=True)
 class Encoding:
     """How pixels lie in a row.
@@ -67,21 +67,17 @@ def pixels_of(
             f"{place}: {len(data)} bytes of pixels for {height} rows of {step} bytes; "
             "the frame is truncated or its sizes are wrong."
         )
-    rows = _rows(layout, data, (row, width, height, step), big_endian)
-    return (layout.convert(rows)[:, :width] if layout.convert else rows), layout.pattern
-
-
-def _rows(layout: Encoding, data: bytes, sizes: tuple[int, int, int, int], big_endian: bool) -> np.ndarray:
-    """The numbers in the rows: (h, w, numbers), (h, w) of one number, (h, bytes) where pixels are packed."""
-    row, width, height, step = sizes
-    dtype = np.dtype(layout.dtype).newbyteorder(">" if big_endian else "<")
-    numbers = int(layout.numbers)
+    dtype, numbers = np.dtype(layout.dtype).newbyteorder(">" if big_endian else "<"), int(layout.numbers)
+    shape, strides = (height, width, numbers), (step, numbers * dtype.itemsize, dtype.itemsize)
     if numbers != layout.numbers:
-        return np.ndarray((height, row), np.uint8, data, strides=(step, 1))
-    shape = (height, width) if numbers == 1 else (height, width, numbers)
-    strides = (step, dtype.itemsize) if numbers == 1 else (step, numbers * dtype.itemsize, dtype.itemsize)
+        # packed into bytes
+        shape, strides = (height, row, 1), (step, 1, 1)
     rows: np.ndarray = np.ndarray(shape, dtype, data, strides=strides)
-    return rows if rows.dtype.isnative and rows.flags.aligned else rows.astype(layout.dtype)
+    if shape[2] == 1:
+        rows = rows[:, :, 0]
+    if not (rows.dtype.isnative and rows.flags.aligned):
+        rows = rows.astype(layout.dtype)
+    return (layout.convert(rows)[:, :width] if layout.convert else rows), layout.pattern
 
 
 def _signed(rows: np.ndarray) -> np.ndarray:
@@ -91,30 +87,24 @@ def _signed(rows: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(rows).view(unsigned) ^ half
 
 
-def _colours(to_bgr: str) -> Callable[[np.ndarray], np.ndarray]:
-    """Colours of 8 bits as BGR, by the name of OpenCV's conversion; of 16 bits their mean, as of deep pictures."""
-
-    def convert(rows: np.ndarray) -> np.ndarray:
-        import cv2
-
-        if rows.dtype == np.uint16:
-            return frame_pixels(rows, "")
-        return cv2.cvtColor(rows, getattr(cv2, to_bgr))
-
-    return convert
+# the mean of deep colours, as of deep pictures
+_mean = partial(frame_pixels, place="")
 
 
 def _signed_colours(rows: np.ndarray) -> np.ndarray:
-    return frame_pixels(_signed(rows), "")
+    return _mean(_signed(rows))
 
 
-def _brightness(place: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Take the brightness from pairs of bytes, a brightness and a colour each."""
+def _to_bgr(conversion: str, rows: np.ndarray) -> np.ndarray:
+    """Colours of 8 bits as BGR, by the name of OpenCV's conversion."""
+    import cv2
 
-    def convert(rows: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(rows[:, :, place])
+    return cv2.cvtColor(rows, getattr(cv2, conversion))
 
-    return convert
+
+def _brightness(place: int, rows: np.ndarray) -> np.ndarray:
+    """The brightness in pairs of bytes, a brightness and a colour each."""
+    return np.ascontiguousarray(rows[:, :, place])
 
 
 def _in_groups(rows: np.ndarray, size: int) -> np.ndarray:
@@ -125,36 +115,26 @@ def _in_groups(rows: np.ndarray, size: int) -> np.ndarray:
     return whole.reshape(height, -1, size)
 
 
-def _bit_stream(bits: int) -> Callable[[np.ndarray], np.ndarray]:
+def _bit_stream(bits: int, rows: np.ndarray) -> np.ndarray:
     """Pixels of 10 or 12 bits one after another, the low bits first (`Mono10p`, `Mono12p`)."""
     # the fewest bytes that hold whole pixels
     size, count = (5, 4) if bits == 10 else (3, 2)
-
-    def convert(rows: np.ndarray) -> np.ndarray:
-        groups = _in_groups(rows, size)
-        out = np.empty((*groups.shape[:2], count), np.uint16)
-        for k in range(count):
-            byte, shift = divmod(bits * k, 8)
-            out[:, :, k] = (groups[:, :, byte] >> shift | groups[:, :, byte + 1] << 8 - shift) & (
-                1 << bits
-            ) - 1
-        return out.reshape(len(rows), -1)
-
-    return convert
+    groups = _in_groups(rows, size)
+    out = np.empty((*groups.shape[:2], count), np.uint16)
+    for k in range(count):
+        byte, shift = divmod(bits * k, 8)
+        both = groups[:, :, byte] >> shift | groups[:, :, byte + 1] << 8 - shift
+        out[:, :, k] = both & (1 << bits) - 1
+    return out.reshape(len(rows), -1)
 
 
-def _gige_vision(bits: int) -> Callable[[np.ndarray], np.ndarray]:
+def _gige_vision(bits: int, rows: np.ndarray) -> np.ndarray:
     """Two pixels in three bytes: high bits, low bits of both, high bits (`Mono10Packed`, `Mono12Packed`)."""
-    low = bits - 8
-
-    def convert(rows: np.ndarray) -> np.ndarray:
-        groups = _in_groups(rows, 3)
-        out = np.empty((*groups.shape[:2], 2), np.uint16)
-        out[:, :, 0] = groups[:, :, 0] << low | groups[:, :, 1] & (1 << low) - 1
-        out[:, :, 1] = groups[:, :, 2] << low | groups[:, :, 1] >> 4 & (1 << low) - 1
-        return out.reshape(len(rows), -1)
-
-    return convert
+    low, groups = bits - 8, _in_groups(rows, 3)
+    out = np.empty((*groups.shape[:2], 2), np.uint16)
+    out[:, :, 0] = groups[:, :, 0] << low | groups[:, :, 1] & (1 << low) - 1
+    out[:, :, 1] = groups[:, :, 2] << low | groups[:, :, 1] >> 4 & (1 << low) - 1
+    return out.reshape(len(rows), -1)
 
 
 def _of_type(
@@ -170,10 +150,10 @@ def _of_type(
 
 def _packed(name: str, pattern: str) -> dict[str, Encoding]:
     return {
-        f"{name}10p": Encoding(np.uint8, 1.25, _bit_stream(10), pattern),
-        f"{name}12p": Encoding(np.uint8, 1.5, _bit_stream(12), pattern),
-        f"{name}10packed": Encoding(np.uint8, 1.5, _gige_vision(10), pattern),
-        f"{name}12packed": Encoding(np.uint8, 1.5, _gige_vision(12), pattern),
+        f"{name}10p": Encoding(np.uint8, 1.25, partial(_bit_stream, 10), pattern),
+        f"{name}12p": Encoding(np.uint8, 1.5, partial(_bit_stream, 12), pattern),
+        f"{name}10packed": Encoding(np.uint8, 1.5, partial(_gige_vision, 10), pattern),
+        f"{name}12packed": Encoding(np.uint8, 1.5, partial(_gige_vision, 12), pattern),
     }
 
 
@@ -185,19 +165,19 @@ ENCODINGS: dict[str, Encoding] = {
     **{f"bayer_{p}8": Encoding(pattern=p) for p in MOSAICS},
     **{f"bayer_{p}16": Encoding(np.uint16, pattern=p) for p in MOSAICS},
     **{
-        f"{order}{bits}": Encoding(dtype, len(order), _colours(f"COLOR_{order.upper()}2BGR"))
-        for order in ("rgb", "rgba", "bgra")
-        for bits, dtype in ((8, np.uint8), (16, np.uint16))
+        f"{order}8": Encoding(np.uint8, len(order), partial(_to_bgr, f"COLOR_{order.upper()}2BGR"))
+        for order in COLOURS
     },
-    "bgr16": Encoding(np.uint16, 3, _colours("")),
+    **{f"{order}16": Encoding(np.uint16, len(order), _mean) for order in COLOURS},
+    "bgr16": Encoding(np.uint16, 3, _mean),
     **_of_type("8U", np.uint8, None, None),
     **_of_type("8S", np.int8, _signed, _signed_colours),
-    **_of_type("16U", np.uint16, None, _colours("")),
+    **_of_type("16U", np.uint16, None, _mean),
     **_of_type("16S", np.int16, _signed, _signed_colours),
-    "uyvy": Encoding(np.uint8, 2, _brightness(1)),
-    "yuv422": Encoding(np.uint8, 2, _brightness(1)),
-    "yuyv": Encoding(np.uint8, 2, _brightness(0)),
-    "yuv422_yuy2": Encoding(np.uint8, 2, _brightness(0)),
+    "uyvy": Encoding(np.uint8, 2, partial(_brightness, 1)),
+    "yuv422": Encoding(np.uint8, 2, partial(_brightness, 1)),
+    "yuyv": Encoding(np.uint8, 2, partial(_brightness, 0)),
+    "yuv422_yuy2": Encoding(np.uint8, 2, partial(_brightness, 0)),
     # the plane of brightness comes first
     "nv12": Encoding(),
     "nv21": Encoding(),

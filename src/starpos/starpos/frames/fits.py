@@ -9,9 +9,8 @@ import math
 import re
 import warnings
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -36,23 +35,12 @@ STEP = 1 << 20
 GZIP_BITS = 31
 
 
-def read_fits(file: BinaryIO, place: str, part: str = "") -> Frame:
-    """Read an open FITS file (also .fz and .gz) by the rules of `reading.read_frame`; FrameError if it holds no frame.
+def read_fits(file: BinaryIO, place: str, part: str = "") -> tuple[Frame, dict[str, Any]]:
+    """Read an open FITS file (also .fz and .gz) by the rules of `reading.read_frame`: the Frame, and its header's KEYS.
 
     place says where it is, for messages; part is the number or the name of the image to take; "": the first one.
+    FrameError if it holds no whole frame.
     """
-    return _read(file, place, part)[0]
-
-
-def decode_fits(data: bytes, source: str) -> tuple[Frame, dict[str, Any]]:
-    """Read the bytes of a FITS file (also .fz): the Frame, and its header's keywords of starpos.frames.header.KEYS.
-
-    source says where the bytes came from. FrameError if they are not a whole frame.
-    """
-    return _read(io.BytesIO(data), source, "")
-
-
-def _read(file: BinaryIO, place: str, part: str) -> tuple[Frame, dict[str, Any]]:
     from astropy.io import fits
 
     try:
@@ -60,10 +48,13 @@ def _read(file: BinaryIO, place: str, part: str) -> tuple[Frame, dict[str, Any]]
             warnings.simplefilter("ignore")
             plain = _plain(file, place)
             with fits.open(plain, memmap=False, lazy_load_hdus=True) as hdus:
-                image = _image(hdus, place, part)
-                header, comments, values = _content(plain, image, place)
-                if _is_meteor_stack(image.primary):
-                    header = _of_meteor_stack(header, image.primary, place)
+                parts = _parts(hdus)
+                primary = parts[0].header if parts else {}
+                is_meteor_stack = all(key in primary for key in STACK_KEYS)
+                number, others = _image(parts, place, part or (MEAN_OF_STACK if is_meteor_stack else ""))
+                header, comments, values = _content(plain, parts, number, place)
+                if is_meteor_stack:
+                    header = _of_meteor_stack(header, primary, place)
     except FrameError:
         raise
     # damaged bytes make astropy, zlib and CFITSIO raise any kind of exception
@@ -71,10 +62,10 @@ def _read(file: BinaryIO, place: str, part: str) -> tuple[Frame, dict[str, Any]]
         raise FrameError(
             f"{place}: this is not a whole FITS image ({one_line(e)}); take or copy it again."
         ) from e
-    if image.others and not _is_meteor_stack(image.primary):
+    if others:
         warnings.warn(
-            f"{place}: its HDU {image.number} is taken, of {1 + len(image.others)} images; to take another name it, "
-            f"like '{place}[{image.others[0]}]'",
+            f"{place}: its HDU {number} is taken, of {1 + len(others)} images; to take another name it, "
+            f"like '{place}[{others[0]}]'",
             stacklevel=3,
         )
     pixels, pattern = to_unsigned(values, place), _pattern(header, place)
@@ -116,15 +107,17 @@ STACK_NAME = re.compile(
 )
 
 
-def _is_meteor_stack(primary: Mapping) -> bool:
-    return all(key in primary for key in STACK_KEYS)
-
-
 def _of_meteor_stack(header: Mapping, primary: Mapping, place: str) -> dict[str, Any]:
     """The header of a stack of video frames as the header of one exposure, as far as its times can be read."""
     made = {key: value for key, value in header.items() if key != "NFRAMES"}
     with suppress(OSError, TypeError, ValueError, LookupError, ZeroDivisionError, configparser.Error):
-        rate = primary[RATE] if RATE in primary else _config_beside(place)["Capture"][RATE]
+        rate = (
+            primary[RATE]
+            if RATE in primary
+            else rms_config(files.read_regular(Path(place).with_name(CONFIG), MAX_CONFIG_BYTES).decode())[
+                "Capture"
+            ][RATE]
+        )
         made.setdefault("EXPTIME", float(primary["NFRAMES"]) / float(rate))
     if "DATE-OBS" not in made and (named := STACK_NAME.search(place)):
         year, month, day, hour, minute, second, part = named.groups()
@@ -139,40 +132,22 @@ def rms_config(text: str) -> configparser.ConfigParser:
     return parser
 
 
-def _config_beside(place: str) -> configparser.ConfigParser:
-    return rms_config(files.read_regular(Path(place).with_name(CONFIG), MAX_CONFIG_BYTES).decode())
-
-
-@dataclass(frozen=True)
-class _Image:
-    """The HDU of a frame, its number, the primary header, and the numbers of other images that might be meant."""
-
-    hdu: Any
-    number: int
-    primary: Mapping
-    others: tuple[int, ...]
-
-
-def _image(hdus: Iterable, place: str, part: str) -> _Image:
-    """The image that is the part, a number or a name, of a file's HDUs; the first frame if that is empty."""
-    parts = _parts(hdus)
-    primary = parts[0].header if parts else {}
+def _image(parts: Sequence, place: str, part: str) -> tuple[int, list[int]]:
+    """The number of the HDU that is the part, a number or a name, and of other frames if that is empty."""
     if part:
         for number, hdu in enumerate(parts):
             if part.upper() in (str(number), str(hdu.name).upper(), f"{hdu.name},{hdu.ver}".upper()):
                 _check_frame(hdu, place)
-                return _Image(hdu, number, primary, ())
+                return number, []
         names = ", ".join(f"{n} {hdu.name}".strip() for n, hdu in enumerate(parts) if _axes(hdu))
         raise FrameError(f"{place}: there is no such HDU; its images are {one_line(names) or 'none'}.")
-    if _is_meteor_stack(primary):
-        return _image(parts, place, MEAN_OF_STACK)
     images = [number for number, hdu in enumerate(parts) if _axes(hdu)]
     if not images:
         raise FrameError(f"{place}: there is no image in this FITS file; give one that holds a frame.")
     frames = [number for number in images if _is_frame(_axes(parts[number]))]
     if not frames:
         _check_frame(parts[images[0]], place)
-    return _Image(parts[frames[0]], frames[0], primary, tuple(frames[1:]))
+    return frames[0], frames[1:]
 
 
 def _parts(hdus: Iterable) -> list[Any]:
@@ -209,20 +184,23 @@ def _check_frame(hdu: Any, place: str) -> None:
         )
 
 
-def _content(file: BinaryIO, image: _Image, place: str) -> tuple[dict[str, Any], dict[str, str], np.ndarray]:
-    """Header (a dict of KEYS), comments and data (h, w) of an image; what its header lacks comes from the primary one.
+def _content(
+    file: BinaryIO, parts: Sequence, number: int, place: str
+) -> tuple[dict[str, Any], dict[str, str], np.ndarray]:
+    """Header (a dict of KEYS), comments and data (h, w) of an HDU; what its header lacks comes from the primary one.
 
     Colours become their mean.
     """
     from astropy.io import fits
 
-    hdu, shape = image.hdu, _axes(image.hdu)
+    hdu = parts[number]
+    shape = _axes(hdu)
     planes = math.prod(shape[:-2])
     check_pixels(shape[-1], shape[-2], planes * abs(int(hdu.header["BITPIX"])) / 8, place)
     if isinstance(hdu, fits.CompImageHDU):
-        _check_tiles(file, image.number, place)
+        _check_tiles(file, number, place)
     headers: tuple[Any, ...] = (
-        (hdu.header,) if hdu.header.get("INHERIT") is False else (image.primary, hdu.header)
+        (hdu.header,) if hdu.header.get("INHERIT") is False else (parts[0].header, hdu.header)
     )
     known = {key: header[key] for header in headers for key in KEYS if key in header}
     comments = {key: str(header.comments[key]) for header in headers for key in KEYS if key in header}

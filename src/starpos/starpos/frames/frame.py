@@ -101,7 +101,11 @@ def in_order(frame: Frame) -> Frame:
 
 
 def to_unsigned(values: np.ndarray, place: str) -> np.ndarray:
-    """Convert real values (h, w) to uint8 or uint16 by the rule of `reading.read_frame`; FrameError for other values."""
+    """Convert real values (h, w) to uint8 or uint16; FrameError for other values.
+
+    Those that fit 16 bits are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their range
+    is wider than that or, for floats, narrower than 4096. A few NaN or infinite pixels become the median.
+    """
     if values.dtype.kind not in "uif":
         raise FrameError(f"{place}: its pixels are {values.dtype}; give numbers.")
     if values.size == 0:
@@ -309,15 +313,5 @@ class Stars(Exposure):
 
 def no_stars(width: int, height: int, **about: Any) -> Stars:
     """The Stars of a frame without stars; `about` are fields of the Exposure."""
-    none = np.zeros(0)
-    return Stars(
-        x=none,
-        y=none,
-        flux=none,
-        snr=none,
-        covariance=np.zeros((0, 2, 2)),
-        flags=none,
-        width=width,
-        height=height,
-        **about,
-    )
+    columns: dict[str, Any] = {name: np.zeros((0, 2, 2) if name == "covariance" else 0) for name in COLUMNS}
+    return Stars(**columns, width=width, height=height, **about)

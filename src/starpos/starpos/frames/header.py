@@ -6,10 +6,11 @@ middle, end and length are compared, with other cards of UTC and with their comm
 give no time, and a length of 0 is unknown. Without a time `untimed` says why.
 """
 
+import itertools
 import math
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,57 +19,15 @@ import erfa
 
 from starpos.errors import FrameError, TimeError, one_line
 from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S, Exposure, Shutter
+from starpos.tables import packaged
 from starpos.units import ARCSEC, DAY_S, UNIX_EPOCH_JD
 
-START, MIDDLE, END = (
-    ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG"),
-    ("DATE-AVG", "MJD-AVG"),
-    ("DATE-END", "MJD-END"),
-)
-# UTC of the start, where DATE-OBS or DATE-BEG is a day alone
-HOURS = (
-    "TIME-OBS",
-    "TIME-BEG",
-    "UT",
-    "UTSTART",
-    "UT-START",
-    "UTCSTART",
-    "UTC",
-    "UTC-OBS",
-    "UT-OBS",
-    "UTSHUT",
-)
-# Other cards with the UTC of some moment of the exposure, which have to agree with those above: dates as text or numbers
-DATES = ("DATE-UTC", "DATE_UTC", "DATE-GPS", "GPS-UTC", "GPS-TIME", "GPSTIME", "JD", "JD-OBS", "OBS-JD", "OBSJD",
-         "JD_UTC", "JD-UTC", "JDSTART", "JUL-DATE", "MJD", "MJD_OBS", "EXPSTART", "UNIXTIME")  # fmt: skip
-# a local time, and its zone: they show whether DATE-OBS is the local one
-LOCAL, ZONES = ("DATE-LOC", "DATE-LT", "LOCTIME", "LOCALTIM"), ("TIMEZONE", "TZ", "TIMEZ")
-# lengths in s: of one exposure (EXP: DWARF), then of all together (LIVETIME: Siril, TOTALEXP: Seestar)
-LENGTHS = ("EXPTIME", "EXPOSURE", "XPOSURE", "EXP", "LIVETIME", "TOTALEXP")
-# number of stacked exposures (Seestar and Siril, IRAF, MaxIm, infrared cameras, Astro Pixel Processor and others)
-COUNTS = ("STACKCNT", "NCOMBINE", "SNAPSHOT", "COADDS", "COADD", "NCOADD", "NCOADDS", "NFRAMES", "NSTACK", "NSTACKED",
-          "LIGH_CNT", "LUM_CNT", "NSUBEXP")  # fmt: skip
-# the second of a stack's inputs (IRAF); the kind of a frame
-SECOND_INPUT, KIND = "IMCMB002", "IMAGETYP"
+# by what they state, as data/cards.csv explains
+CARDS = {row["stated"]: tuple(row["keywords"].split()) for row in packaged("starpos.frames", "cards.csv")}
+KEYS = tuple(itertools.chain.from_iterable(CARDS.values()))
+START, MIDDLE, END = CARDS["start"], CARDS["middle"], CARDS["end"]
+HOURS, DATES, LENGTHS = CARDS["hours"], CARDS["dates"], CARDS["length"]
 STACKED = re.compile(r"\b(master *(light)?|stack(ed)?|integration|co-?add(ed)?|sum(med)?)\b", re.IGNORECASE)
-# when the file was written, some time after the exposure; a local time may seem earlier
-WRITTEN = "DATE"
-TIME_KEYS = (
-    WRITTEN,
-    *START,
-    *MIDDLE,
-    *END,
-    *HOURS,
-    *DATES,
-    *LOCAL,
-    *ZONES,
-    *LENGTHS,
-    *COUNTS,
-    SECOND_INPUT,
-    KIND,
-    "TIMESYS",
-    "TIMEUNIT",
-)
 # Time scales of TIMESYS that are read; UT1 would need tables.
 TIME_SCALES = ("utc", "tai", "tt", "tdb", "gps")
 GPS_BEHIND_TAI_S = 19.0
@@ -105,32 +64,8 @@ CLOCK = re.compile(r"(\d\d?):(\d\d)(?::(\d\d(?:\.\d*)?))?", re.ASCII)
 LEAST_MJD, MOST_MJD, LEAST_JD, LEAST_UNIX_S = 3e4, 1e5, 2.43e6, 9e8
 # smallest step of an MJD's last digit: below it lie the last bits of a double
 MIN_MJD_STEP_S = 1e-3
-# Cards with the column and row of the sensor's frame at which a frame begins, in pixels of this frame, and their sign:
-# positive by SBFITSEXT (MaxIm, APT, Seestar and others), negative in IRAF's physical coordinates
-CROPS = ((("XORGSUBF", "YORGSUBF"), 1.0), (("LTV1", "LTV2"), -1.0))
-# IRAF's size of a pixel in physical ones
-LTM = ("LTM1_1", "LTM2_2")
-# arcsec per px, by INDI, Sequence Generator Pro and others
-PLATE_SCALES = ("SCALE", "PIXSCALE", "SECPIX1")
 # minimum of a focal length, a pixel or a scale that counts as stated
 LEAST = 1e-9
-# latitude and longitude of a site, deg: programs differ in the sign of the longitude
-SITES = (("SITELAT", "SITELONG"), ("LAT-OBS", "LONG-OBS"), ("OBSGEO-B", "OBSGEO-L"))
-# right ascension and declination of a pointing
-AIMS = (("RA", "DEC"), ("OBJCTRA", "OBJCTDEC"), ("TELRA", "TELDEC"))
-KEYS = (
-    *TIME_KEYS,
-    *(key for keys in (*SITES, *AIMS) for key in keys),
-    *(key for keys, _ in CROPS for key in keys),
-    *LTM,
-    *PLATE_SCALES,
-    "BAYERPAT",
-    "XBAYROFF",
-    "YBAYROFF",
-    "FOCALLEN",
-    "XPIXSZ",
-    "ROLLSHUT",
-)
 
 
 def read_exposure(header: Mapping, place: str, comments: Mapping[str, str] = NO_COMMENTS) -> Exposure:
@@ -150,12 +85,17 @@ def read_exposure(header: Mapping, place: str, comments: Mapping[str, str] = NO_
     )
 
 
+def _stated(header: Mapping, keys: Iterable[str]) -> list[str]:
+    """Choose the cards that a header has with a value, from some."""
+    return [key for key in keys if header.get(key) not in (None, "")]
+
+
 def aim_deg(header: Mapping) -> tuple[float, float] | None:
     """Right ascension and declination (deg) to which a header says that the telescope was pointed; None without.
 
     A number is in deg, a text with colons or blanks in h m s and in deg ' ".
     """
-    for keys in AIMS:
+    for keys in zip(CARDS["right_ascension"], CARDS["declination"], strict=True):
         right, up = (_sexagesimal(header.get(key)) for key in keys)
         if right is not None and up is not None:
             (ra, in_hours), (dec, _) = right, up
@@ -179,19 +119,20 @@ def _sexagesimal(value: Any) -> tuple[float, bool] | None:
 
 def site_cards(header: Mapping) -> str:
     """The cards with which a header states a site, for messages; '' without any."""
-    for keys in SITES:
-        if all(header.get(key) not in (None, "") for key in keys):
+    for keys in zip(CARDS["latitude"], CARDS["longitude"], strict=True):
+        if len(_stated(header, keys)) == 2:
             return " and ".join(f"{key} {one_line(header[key])}" for key in keys)
     return ""
 
 
 def origin_px(header: Mapping) -> tuple[float, float] | None:
     """Column and row of the sensor's frame at which a frame begins; None if nothing says so, NaN for no numbers."""
-    for keys, sign in CROPS:
-        if any(header.get(key) not in (None, "") for key in keys):
+    for begins, sign in (("", 1.0), ("minus_", -1.0)):
+        keys = CARDS[f"{begins}left"] + CARDS[f"{begins}top"]
+        if _stated(header, keys):
             with suppress(TypeError, ValueError, OverflowError):
                 left, top = (sign * float(header.get(key) or 0) for key in keys)
-                scales = [float(header.get(key) or 1) for key in LTM if sign < 0]
+                scales = [float(header.get(key) or 1) for key in CARDS["minus_scale"] if sign < 0]
                 if math.isfinite(left) and math.isfinite(top) and all(scale == 1 for scale in scales):
                     return left + 0.0, top + 0.0
             return math.nan, math.nan
@@ -223,7 +164,7 @@ def focal_px(header: Mapping) -> float | None:
     focal, pixel_um = _positive(header, "FOCALLEN"), _positive(header, "XPIXSZ")
     if focal is not None and pixel_um is not None:
         return focal * 1000.0 / pixel_um
-    scales = (_positive(header, key) for key in PLATE_SCALES)
+    scales = (_positive(header, key) for key in CARDS["plate_scale"])
     return next((1.0 / (scale * ARCSEC) for scale in scales if scale is not None), None)
 
 
@@ -242,23 +183,13 @@ def focal_mm(focal_px: float, pixel_um: float) -> float:
 
 
 @dataclass(frozen=True)
-class _Instant:
-    """A time of a card: Julian date in TAI in two parts, and its standard deviation (s) by its last digit."""
+class _Moment:
+    """A moment by some cards: s in TAI since 1970, and its standard deviation by its last digit.
 
-    day: float
-    part: float
-    stddev_s: float
+    As differences are formed in TAI, exposures across a leap second come out right.
+    """
 
-    def since_s(self, other: "_Instant") -> float:
-        """Time in s from another instant to this one."""
-        return ((self.day - other.day) + (self.part - other.part)) * DAY_S
-
-
-@dataclass(frozen=True)
-class _Middle:
-    """The middle of the exposure, s after an instant, by some cards."""
-
-    after_s: float
+    tai_s: float
     stddev_s: float
     by: str
 
@@ -271,31 +202,27 @@ def read_times(header: Mapping, comments: Mapping[str, str] = NO_COMMENTS) -> Ex
     stamp_stddev_s comes from the last digit of a time, which may be rounded or cut off, and from how far cards that
     should agree are apart. A header without any card of a time has an empty untimed.
     """
+    exposure_s = None
     try:
         _check_single(header)
         lengths = _lengths(header, comments)
-    except TimeError as e:
-        return Exposure(untimed=str(e))
-    exposure_s = next(iter(lengths.values()), None)
-    try:
+        exposure_s = next(iter(lengths.values()), None)
         header = _as_commented(header, comments)
-        instants = _instants(header)
-        middles, zero = _middles(instants, lengths)
-    except TimeError as e:
-        return Exposure(exposure_s=exposure_s, untimed=str(e))
-    if zero is None or not middles:
-        return Exposure(exposure_s=exposure_s, untimed="" if zero is None else _no_length(header))
-    best = min(middles, key=lambda m: m.stddev_s)
-    other = max(middles, key=lambda m: _apart_s(m, best))
-    if (apart_s := _apart_s(other, best)) > MAX_APART_S:
-        return Exposure(
-            untimed=f"the middle of its exposure by {best.by} and by {other.by} differ by "
-            f"{abs(other.after_s - best.after_s):.3g} s: these cards contradict each other, correct the header"
-        )
-    if exposure_s is None:
-        exposure_s = _span_s(instants)
-    mid_unix_s = _unix_s(zero.day, zero.part + best.after_s / DAY_S)
-    try:
+        moments = _moments(header)
+        middles = _middles(moments, lengths)
+        if not middles:
+            return Exposure(exposure_s=exposure_s, untimed=_no_length(header) if moments else "")
+        best = min(middles, key=lambda m: m.stddev_s)
+        other = max(middles, key=lambda m: _apart_s(m, best))
+        if (apart_s := _apart_s(other, best)) > MAX_APART_S:
+            exposure_s = None
+            raise TimeError(
+                f"the middle of its exposure by {best.by} and by {other.by} differ by "
+                f"{abs(other.tai_s - best.tai_s):.3g} s: these cards contradict each other, correct the header"
+            )
+        if exposure_s is None:
+            exposure_s = _span_s(moments)
+        mid_unix_s = _unix_s(best.tai_s)
         off_s = _off_others_s(header, mid_unix_s, exposure_s or 0.0)
         _check_zone(header, mid_unix_s, exposure_s or 0.0)
         _check_written(header, mid_unix_s)
@@ -309,10 +236,8 @@ def read_times(header: Mapping, comments: Mapping[str, str] = NO_COMMENTS) -> Ex
 def _as_commented(header: Mapping, comments: Mapping[str, str]) -> Mapping:
     """The header with its start as the comment calls it: the middle or the end; TimeError for a time that is not UTC."""
     values = dict(header)
-    for key in START:
+    for key in _stated(header, START):
         comment = comments.get(key, "")
-        if not comment or values.get(key) in (None, ""):
-            continue
         local = OFFSET.search(comment) or ZONE.search(comment) or LOCALLY.search(comment)
         if local and not UNIVERSAL.search(comment):
             raise TimeError(
@@ -374,10 +299,7 @@ def _other_unix_s(header: Mapping, key: str, near_unix_s: float) -> tuple[float,
         return None
     try:
         if isinstance(value, str) and (text := _as_today(value)) and ISO_TIME.fullmatch(text):
-            with warnings.catch_warnings():
-                # of years whose leap seconds are not known yet
-                warnings.simplefilter("ignore", erfa.ErfaWarning)
-                return _unix_s(*_tai(*_day_of(text, "utc"), "utc")), math.sqrt(3) * _rounding(text)
+            return _unix_s(_tai_s(text, "utc")), math.sqrt(3) * _rounding(text)
         if isinstance(value, str) and (clock := CLOCK.fullmatch(value.strip())):
             hours, minutes, seconds = clock.groups()
             of_day_s = int(hours) * 3600 + int(minutes) * 60 + float(seconds or 0)
@@ -385,7 +307,7 @@ def _other_unix_s(header: Mapping, key: str, near_unix_s: float) -> tuple[float,
             later_s = math.remainder(of_day_s - near_unix_s, DAY_S)
             return near_unix_s + later_s, step_s
         number = float(value)
-    except (TypeError, ValueError, OverflowError, erfa.ErfaError):
+    except (TypeError, ValueError, OverflowError):
         return None
     # a Unix time, a Julian date or an MJD, by its size
     if key not in DATES or key.startswith("GPS") or not math.isfinite(number):
@@ -400,13 +322,13 @@ def _other_unix_s(header: Mapping, key: str, near_unix_s: float) -> tuple[float,
 
 def _check_zone(header: Mapping, mid_unix_s: float, exposure_s: float) -> None:
     """TimeError if the time of the exposure may be the local one of the header's zone."""
-    zone = next((key for key in ZONES if header.get(key) not in (None, "")), None)
-    offset_h = None if zone is None else _offset_h(header[zone])
+    zone = next(iter(_stated(header, CARDS["zone"])), "")
+    offset_h = _offset_h(header.get(zone))
     if not offset_h:
         return
     if any(_other_unix_s(header, key, mid_unix_s) is not None for key in (*HOURS, *DATES)):
         return
-    for key in LOCAL:
+    for key in CARDS["local"]:
         if (local := _other_unix_s(header, key, mid_unix_s)) is not None:
             if abs(local[0] - mid_unix_s) > exposure_s + FOUND_S:
                 return
@@ -422,7 +344,7 @@ def _check_zone(header: Mapping, mid_unix_s: float, exposure_s: float) -> None:
 
 def _check_written(header: Mapping, mid_unix_s: float) -> None:
     """TimeError if the file was written more than a day before the exposure."""
-    written = _other_unix_s(header, WRITTEN, mid_unix_s)
+    written = _other_unix_s(header, "DATE", mid_unix_s)
     if written is not None and mid_unix_s - written[0] > DAY_S:
         days = (mid_unix_s - written[0]) / DAY_S
         raise TimeError(
@@ -444,24 +366,24 @@ def _offset_h(value: Any) -> float | None:
     return -hours if found[1] == "-" else hours
 
 
-def _apart_s(one: _Middle, other: _Middle) -> float:
+def _apart_s(one: _Moment, other: _Moment) -> float:
     """How much farther two middles are apart than rounding of their digits explains."""
     step_s = math.sqrt(3) * (one.stddev_s + other.stddev_s)
     # and the last bits of sums
-    return max(0.0, abs(one.after_s - other.after_s) - step_s - 1e-6)
+    return max(0.0, abs(one.tai_s - other.tai_s) - step_s - 1e-6)
 
 
 def _check_single(header: Mapping) -> None:
     """Raise TimeError for a stack: it shows the sky of one of its exposures, which need not be the middle one."""
-    for key in COUNTS:
+    for key in CARDS["count"]:
         count = header.get(key)
         if isinstance(count, (int, float)) and count > 1:
             raise TimeError(
                 f"it is a stack of {count:g} exposures ({key}), whose light has no one time: give single exposures"
             )
-    kind = str(header.get(KIND) or "")
-    if header.get(SECOND_INPUT) not in (None, "") or STACKED.search(kind):
-        by = KIND if STACKED.search(kind) else SECOND_INPUT
+    named = STACKED.search(str(header.get("IMAGETYP") or ""))
+    if named or header.get("IMCMB002") not in (None, ""):
+        by = "IMAGETYP" if named else "IMCMB002"
         raise TimeError(
             f"it is a stack of exposures ({by}), whose light has no one time: give single exposures"
         )
@@ -471,9 +393,8 @@ def _lengths(header: Mapping, comments: Mapping[str, str]) -> dict[str, float]:
     """The lengths of the exposure in s by card; 0 is missing. TimeError for a value that is not a length."""
     lengths = {}
     general = str(header.get("TIMEUNIT") or "s").strip().lower()
-    for key in LENGTHS:
-        if (value := header.get(key)) in (None, ""):
-            continue
+    for key in _stated(header, LENGTHS):
+        value = header[key]
         named = re.search(r"\[ *(\w+) *\]", comments.get(key, ""))
         unit_s = UNITS_S.get(named[1].lower() if named else general)
         try:
@@ -490,69 +411,57 @@ def _lengths(header: Mapping, comments: Mapping[str, str]) -> dict[str, float]:
 
 
 def _no_length(header: Mapping) -> str:
-    zero = [key for key in LENGTHS if header.get(key) not in (None, "")]
-    if zero:
+    if zero := _stated(header, LENGTHS):
         return f"how long it was exposed is unknown, its {zero[0]} is 0: correct the header"
     return "how long it was exposed is unknown: its header needs EXPTIME"
 
 
-def _instants(header: Mapping) -> dict[str, _Instant]:
+def _moments(header: Mapping) -> dict[str, _Moment]:
     """The times in the header by card; TimeError for a value that is not a time."""
-    keys = [key for key in (*START, *MIDDLE, *END) if header.get(key) not in (None, "")]
+    keys = _stated(header, (*START, *MIDDLE, *END))
     scale = str(header.get("TIMESYS") or "UTC").strip().lower()
     if keys and scale not in TIME_SCALES:
         raise TimeError(f"its TIMESYS is {scale[:20]!r}: it must be one of {', '.join(TIME_SCALES)}")
-    instants = {key: _instant(header, key, scale) for key in keys}
-    return {key: instant for key, instant in instants.items() if instant is not None}
+    moments = {key: _moment(header, key, scale) for key in keys}
+    return {key: moment for key, moment in moments.items() if moment is not None}
 
 
-def _middles(
-    instants: Mapping[str, _Instant], lengths: Mapping[str, float]
-) -> tuple[list[_Middle], _Instant | None]:
-    """The middles of the exposure by the cards, and the instant they count from; TimeError if they end early."""
-    if not instants:
-        return [], None
-    zero = next(iter(instants.values()))
+def _middles(moments: Mapping[str, _Moment], lengths: Mapping[str, float]) -> list[_Moment]:
+    """The middles of the exposure by the cards; TimeError if they end early."""
     starts, middles, ends = (
-        {key: instants[key] for key in keys if key in instants} for keys in (START, MIDDLE, END)
+        [moments[key] for key in keys if key in moments] for keys in (START, MIDDLE, END)
     )
-    by_cards = [_Middle(m.since_s(zero), m.stddev_s, key) for key, m in middles.items()]
-    for key, start in starts.items():
-        at_s = start.since_s(zero)
-        by_cards += [
-            _Middle(at_s + s / 2, start.stddev_s, f"{key} with {length}") for length, s in lengths.items()
+    for start in starts:
+        middles += [
+            _Moment(start.tai_s + s / 2, start.stddev_s, f"{start.by} with {key}")
+            for key, s in lengths.items()
         ]
-        for last, end in ends.items():
-            span_s = end.since_s(start)
-            if span_s < 0:
-                raise TimeError(f"its {last} is before its {key}: correct the header")
+        for end in ends:
+            if end.tai_s < start.tai_s:
+                raise TimeError(f"its {end.by} is before its {start.by}: correct the header")
             # an end is often the arrival of the frame: a start and a length are better
             stddev_s = math.hypot(start.stddev_s, end.stddev_s)
-            by_cards.append(_Middle(at_s + span_s / 2, stddev_s, f"{key} with {last}"))
+            middles.append(_Moment((start.tai_s + end.tai_s) / 2, stddev_s, f"{start.by} with {end.by}"))
     if not starts:
         # a clock read on arrival of the frame is late
-        by_cards += [
-            _Middle(
-                end.since_s(zero) - s / 2,
-                math.hypot(end.stddev_s, UNKNOWN_LATENCY_S),
-                f"{last} with {length}",
-            )
-            for last, end in ends.items()
-            for length, s in lengths.items()
+        middles += [
+            _Moment(end.tai_s - s / 2, math.hypot(end.stddev_s, UNKNOWN_LATENCY_S), f"{end.by} with {key}")
+            for end in ends
+            for key, s in lengths.items()
         ]
-    return by_cards, zero
+    return middles
 
 
-def _span_s(instants: Mapping[str, _Instant]) -> float | None:
+def _span_s(moments: Mapping[str, _Moment]) -> float | None:
     """The length of the exposure from its start to its end, as far as these are known."""
-    start, end = (next((instants[key] for key in keys if key in instants), None) for keys in (START, END))
+    start, end = (next((moments[key] for key in keys if key in moments), None) for keys in (START, END))
     if start is None or end is None:
         return None
-    span_s = end.since_s(start)
+    span_s = end.tai_s - start.tai_s
     return span_s if 0 < span_s <= MAX_EXPOSURE_S else None
 
 
-def _instant(header: Mapping, key: str, scale: str) -> _Instant | None:
+def _moment(header: Mapping, key: str, scale: str) -> _Moment | None:
     """The time of a card; None if it is a day without an hour. TimeError if it is not a time."""
     value = header[key]
     if key.startswith("MJD"):
@@ -570,32 +479,27 @@ def _instant(header: Mapping, key: str, scale: str) -> _Instant | None:
                 f"its {key} is {value!r}, which is no text: write it like 2026-11-02T18:00:00.000"
             )
         if DAY.fullmatch(value):
-            hours = next((header[k] for k in HOURS if header.get(k) not in (None, "")), None)
-            if hours is None or key in (*MIDDLE, *END):
+            hours = _stated(header, HOURS)
+            if not hours or key in (*MIDDLE, *END):
                 return None
-            hours = str(hours).strip()
             # a card of the hours may repeat the day
-            value = _as_today(hours) if str(_as_today(hours)).startswith(f"{value}T") else f"{value}T{hours}"
+            hour = _as_today(str(header[hours[0]]))
+            value = hour if hour.startswith(f"{value}T") else f"{value}T{hour}"
     try:
-        with warnings.catch_warnings():
-            # of years whose leap seconds are not known yet
-            warnings.simplefilter("ignore", erfa.ErfaWarning)
-            # a second beyond the end of its minute
-            warnings.filterwarnings("error", ".*(after end of day|both of)", erfa.ErfaWarning)
-            day, part = _tai(*_day_of(value, scale), scale)
-    except (erfa.ErfaError, erfa.ErfaWarning, ValueError, TypeError, OverflowError):
+        return _Moment(_tai_s(value, scale), _rounding(value), key)
+    except (ValueError, TypeError, OverflowError):
         raise TimeError(
             f"its {key} is {one_line(repr(value))}, which is no time of an exposure (hours to 23, minutes and seconds to "
             "59): write it like 2026-11-02T18:00:00.000"
         ) from None
-    return _Instant(day, part, _rounding(value))
 
 
-def _unix_s(day: float, part: float) -> float:
-    """Unix time of a Julian date in TAI; as sums are formed in TAI, exposures across a leap second come out right."""
+def _unix_s(tai_s: float) -> float:
+    """Unix time of a number of seconds in TAI since 1970."""
+    days, rest_s = divmod(tai_s, DAY_S)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)
-        day, part = erfa.taiutc(day, part)
+        day, part = erfa.taiutc(UNIX_EPOCH_JD + days, rest_s / DAY_S)
     return float((day - UNIX_EPOCH_JD) * DAY_S + part * DAY_S)
 
 
@@ -620,32 +524,39 @@ def _rounding(start: float | str) -> float:
     return 10.0 ** -len(decimals[1] or "") / math.sqrt(3)
 
 
-def _day_of(start: float | str, scale: str) -> tuple[float, float]:
-    """Julian date of a time in its scale, in two parts: ERFA's quasi-JD for UTC; ValueError if invalid.
+def _tai_s(start: float | str, scale: str) -> float:
+    """Seconds in TAI since 1970 of a text or an MJD in its scale; ValueError if it is no time.
 
     By ERFA alone: astropy's times, which are ERFA's, take as long to import as the rest of a program's start.
     """
-    if not isinstance(start, str):
-        if not abs(start) < FARTHEST_MJD:
-            raise ValueError(start)
-        return MJD_ZERO_JD, start
-    found = ISO_TIME.fullmatch(start.strip())
-    if found is None:
-        raise ValueError(start)
-    *whole, seconds = found.groups()
-    # GPS time has no leap seconds, like TAI
-    return tuple(erfa.dtf2d("UTC" if scale == "utc" else "TAI", *map(int, whole), float(seconds or 0)))
-
-
-def _tai(day: float, part: float, scale: str) -> tuple[float, float]:
-    """The Julian date in TAI of one in another scale, each in two parts."""
-    if scale == "tai":
-        return day, part
-    if scale == "utc":
-        return tuple(erfa.utctai(day, part))
-    if scale == "gps":
-        return day, part + GPS_BEHIND_TAI_S / DAY_S
-    if scale == "tdb":
-        # at the geocentre; the time of day has no part in it there
-        day, part = erfa.tdbtt(day, part, erfa.dtdb(day, part, 0.0, 0.0, 0.0, 0.0))
-    return tuple(erfa.tttai(day, part))
+    try:
+        with warnings.catch_warnings():
+            # of years whose leap seconds are not known yet
+            warnings.simplefilter("ignore", erfa.ErfaWarning)
+            # a second beyond the end of its minute
+            warnings.filterwarnings("error", ".*(after end of day|both of)", erfa.ErfaWarning)
+            if isinstance(start, str):
+                found = ISO_TIME.fullmatch(start.strip())
+                if found is None:
+                    raise ValueError(start)
+                *whole, seconds = found.groups()
+                # GPS time has no leap seconds, like TAI
+                day, part = erfa.dtf2d(
+                    "UTC" if scale == "utc" else "TAI", *map(int, whole), float(seconds or 0)
+                )
+            elif abs(start) < FARTHEST_MJD:
+                day, part = MJD_ZERO_JD, start
+            else:
+                raise ValueError(start)
+            if scale == "utc":
+                day, part = erfa.utctai(day, part)
+            if scale == "gps":
+                part += GPS_BEHIND_TAI_S / DAY_S
+            if scale == "tdb":
+                # at the geocentre; the time of day has no part in it there
+                day, part = erfa.tdbtt(day, part, erfa.dtdb(day, part, 0.0, 0.0, 0.0, 0.0))
+            if scale in ("tdb", "tt"):
+                day, part = erfa.tttai(day, part)
+    except (erfa.ErfaError, erfa.ErfaWarning) as e:
+        raise ValueError(start) from e
+    return float((day - UNIX_EPOCH_JD) * DAY_S + part * DAY_S)

@@ -28,26 +28,12 @@ RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef")
 def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | Stars:
     """Read one exposure, or the star list of one; the file's suffix says which.
 
-    FITS (also .fz and .gz): DATE-OBS (or DATE-BEG, MJD-OBS, MJD-BEG) is the start of the exposure in UTC (or in
-    TIMESYS), whose last digit is its error. EXPTIME or EXPOSURE is its length in s, where 0 is unknown; a DATE-AVG is
-    its middle, a DATE-END its end. Where these contradict each other, or the frame is a stack (STACKCNT), there is no
-    time.
-    XORGSUBF and YORGSUBF (or LTV1 and LTV2) say of which part of the sensor a frame is. BAYERPAT (XBAYROFF, YBAYROFF) is
-    the mosaic; FOCALLEN (mm) and XPIXSZ (um), or SCALE (arcsec), give focal_px. The first row of the file is row 0.
-    Values that fit 16 bits are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their
-    range is wider than that or, for floats, narrower than 4096. A few NaN or infinite pixels become the median.
-    Values farther from it than any light (frame.LOUDEST) are clipped. Of several images (HDUs) the first is taken,
-    with a warning; `a.fits[2]` or `a.fits[SCI]` is another one, by its number from 0 or its EXTNAME. What its header
-    lacks comes from the primary one.
-    Three planes (NAXIS3 = 3) are colours, and become their mean.
-    TIFF, PNG, JPEG, BMP: 8 or 16 bits, grey or colour; TIFF also of floats, by the rule above. Colours of more than 8
-    bits become the mean of the three. HEIF: the same, through pillow-heif.
-    Camera raw: the mosaic as the sensor gave it, through rawpy.
-    The exposure of pictures and raw files, and about their focal length, come from EXIF if exifread is installed; their
-    time too, but only with a clock.
-    CSV: a first line `# {"NAXIS1": ..., "NAXIS2": ..., "DATE-OBS": ..., "EXPTIME": ...}`, in which the NAXIS pair is
-    required, then columns x, y, flux and optionally sigma (px); without it sigma is 0.1 px. The SNR is 1 px / sigma, as
-    for a star image whose standard deviation is 1 px.
+    docs/reference/files.md has the kinds of files, the cards of FITS that are read, and the form of a list of stars
+    (CSV), whose SNR is 1 px / sigma, as for a star image whose standard deviation is 1 px. Row 0 is the first of the
+    file. Of several images (HDUs) the first is taken, with a warning; `a.fits[2]` or `a.fits[SCI]` is another one. Three
+    planes, and colours of more than 8 bits, become their mean; `frame.to_unsigned` converts other values. The exposure
+    of pictures and raw files, and about their focal length, come from EXIF if exifread is installed; their time too, but
+    only with a clock.
 
     Without a time or an exposure mid_unix_s is None, and untimed says why.
 
@@ -93,7 +79,7 @@ def _part_of(path: Path) -> tuple[Path, str]:
 def _read(file: BinaryIO, place: str, suffix: str, part: str, clock: CameraClock | None) -> Frame | Stars:
     """Read an open file as files with this suffix are read."""
     if suffix in FITS:
-        return in_order(read_fits(file, place, part))
+        return in_order(read_fits(file, place, part)[0])
     if suffix == ".csv":
         return read_star_list(file, place)
     for suffixes, decode in ((PICTURE + JPEG, picture_frame), (HEIF, heif_frame), (RAW, raw_frame)):

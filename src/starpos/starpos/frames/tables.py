@@ -143,10 +143,9 @@ def write_star_list(path: Path | str, stars: Stars, start_utc: str, pixel_um: fl
         header["ROLLSHUT"] = stars.shutter.readout_s
     if stars.fwhm_px is not None:
         header["FWHM"] = round(stars.fwhm_px, 3)
-    sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)
     rows = "".join(
         f"{x:.5f},{y:.5f},{f:.2f},{s:.5f},{flags}\n"
-        for x, y, f, s, flags in zip(stars.x, stars.y, stars.flux, sigma, stars.flags, strict=True)
+        for x, y, f, s, flags in zip(stars.x, stars.y, stars.flux, stars.sigma, stars.flags, strict=True)
     )
     Path(path).write_text(f"# {json.dumps(header)}\nx,y,flux,sigma,flags\n{rows}", encoding="utf-8")
 

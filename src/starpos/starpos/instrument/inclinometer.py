@@ -14,10 +14,6 @@ from starpos.units import ARCSEC, HOUR_S
 
 # The -D01 variant.
 SCA100T_RANGE_RAD = np.radians(30.0)
-# Output at zero tilt with a 5 V supply (paper, section 3.1)
-SCA100T_OFFSET_V = 2.5
-# The -D01 variant.
-SCA100T_SENSITIVITY_V_PER_G = 4.0
 # Noise of one 10 Hz sample, 1 sigma: the paper's resolution.
 SCA100T_NOISE_RAD = np.radians(0.0035)
 
@@ -337,11 +333,3 @@ def level_of(up: np.ndarray) -> np.ndarray:
     cb, sb = np.sqrt(up[1] ** 2 + up[2] ** 2), -up[0]
     sa, ca = up[1] / cb, up[2] / cb
     return np.array([[cb, sa * sb, ca * sb], [0.0, ca, -sa], [-sb, sa * cb, ca * cb]])
-
-
-def levelling_of(a2: np.ndarray) -> np.ndarray:
-    """Matrix (3, 3) from a change of up (3,) in S to a small rotation (3,) of L about its axes; zero about Z.
-
-    a2 (3, 3): S into L.
-    """
-    return np.array([a2[1], -a2[0], np.zeros(3)])

@@ -202,32 +202,25 @@ class Calibration:
     response_covariance: tuple = ()
 
     def __post_init__(self) -> None:
-        for name, numbers in (
-            ("misalignment_deg", self.misalignment_deg),
-            ("calibration's covariance", np.ravel(self.covariance_arcsec2)),
-            ("calibration's tilt_deg", self.tilt_deg),
-            ("calibration's response", [*self.response, *np.ravel(self.response_covariance)]),
-        ):
-            if not np.isfinite(np.asarray(numbers, float)).all():
-                raise InstrumentError(f"the instrument's {name} is not a finite number: give one")
-        if len(self.misalignment_deg) != 3 or len(self.tilt_deg) not in (2, 3):
-            raise InstrumentError("misalignment_deg is three numbers, tilt_deg of a calibration two or three")
-        if max(abs(angle) for angle in self.misalignment_deg) > 360:
+        angles, tilt = np.asarray(self.misalignment_deg, float), np.asarray(self.tilt_deg, float)
+        # each false for NaN too
+        if not (angles.shape == (3,) and np.abs(angles).max() <= 360):
             raise InstrumentError(
-                "an angle of misalignment_deg is beyond 360 deg: give A3's three angles in deg"
+                "misalignment_deg is three numbers within 360 deg: give A3's three angles in deg"
             )
-        if (
-            max(abs(angle) for angle in self.tilt_deg) > 90
-            or np.sum(np.sin(np.radians(self.tilt_deg[:2])) ** 2) > 1
+        if not (
+            tilt.shape in ((2,), (3,))
+            and np.abs(tilt).max() <= 90
+            and np.sum(np.sin(np.radians(tilt[:2])) ** 2) <= 1
         ):
             raise InstrumentError(
-                "tilt_deg of the calibration is impossible: give the elevations of the inclinometer's axes, "
+                "tilt_deg of the calibration is impossible: give the elevations of the inclinometer's two or three axes, "
                 "in deg"
             )
         if not (np.isnan(self.temperature_c) or abs(self.temperature_c) < MAX_C):
             raise InstrumentError(f"temperature_c of the calibration is {self.temperature_c:g}: give deg C")
         covariance = np.asarray(self.covariance_arcsec2, float)
-        if np.abs(covariance).max() > MAX_ARCSEC**2:
+        if not np.abs(covariance).max() <= MAX_ARCSEC**2:
             raise InstrumentError(
                 f"the calibration's covariance is beyond any turn: give variances of at most {MAX_ARCSEC**2:g} arcsec2"
             )
@@ -264,7 +257,7 @@ class Calibration:
                 f"the calibration's response has {n} coefficients: give the 5 of two axes or the 9 of three, and a "
                 "covariance of as many rows and columns"
             )
-        if max(abs(c) for c in self.response) > MAX_RESPONSE:
+        if not np.abs(self.response).max() <= MAX_RESPONSE:
             raise InstrumentError(
                 f"the calibration's response is not valid: its coefficients must be at most {MAX_RESPONSE:g}"
             )
@@ -389,14 +382,7 @@ class Instrument:
     vertical: CameraVertical | None = None
 
     def __post_init__(self) -> None:
-        for name, numbers in (
-            ("focal length", [self.focal_px]),
-            ("link_to_camera", np.ravel(self.link_to_camera)),
-            ("clock_stddev", [self.clock_stddev_s]),
-        ):
-            if not np.isfinite(np.asarray(numbers, float)).all():
-                raise InstrumentError(f"the instrument's {name} is not a finite number: give one")
-        if self.focal_px <= 0:
+        if not 0 < self.focal_px < math.inf:
             raise InstrumentError(
                 f"focal length {self.focal_px:g} px: must be positive (focal_mm * 1000 / pixel_um)"
             )

@@ -35,18 +35,18 @@ def read_camera(path: Path) -> Camera:
     try:
         model = content.get("distortion_model", "plumb_bob")
         width, height = content["image_width"], content["image_height"]
-        k = _ros_numbers(content["camera_matrix"], 9)
+        k = tuple(float(value) for value in content["camera_matrix"]["data"])
         terms = content.get("distortion_coefficients")
         d = () if terms is None else tuple(float(value) for value in terms["data"])
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InstrumentError(
             f"{path}: a key of this calibration file is missing or of the wrong kind ({repr(error)[:120]}); "
-            "it needs image_width, image_height, camera_matrix, distortion_coefficients."
+            "it needs image_width, image_height, camera_square, distortion_coefficients."
         ) from None
     model, d = stated_lens(model if isinstance(model, str) else reprlib.repr(model), d, str(path))
     if any(type(side) is not int or side > LARGEST_SIDE for side in (width, height)):
         raise InstrumentError(f"{path}: image_width and image_height must be whole numbers of px.")
-    if any(k[i] for i in (1, 3, 6, 7)) or k[8] != 1:
+    if len(k) != 9 or any(k[i] for i in (1, 3, 6, 7)) or k[8] != 1:
         raise InstrumentError(
             f"{path}: camera_matrix is not [fx 0 cx, 0 fy cy, 0 0 1]; calibrate without skew."
         )
@@ -57,13 +57,6 @@ def read_camera(path: Path) -> Camera:
         )
     except InstrumentError as error:
         raise InstrumentError(f"{path}: {error}") from None
-
-
-def _ros_numbers(matrix: dict, count: int) -> tuple[float, ...]:
-    values = tuple(float(value) for value in matrix["data"])
-    if len(values) != count:
-        raise ValueError(f"{len(values)} values for {count}")
-    return values
 
 
 def write_camera(path: Path, camera: Camera, name: str, comment: str = "") -> None:
@@ -132,35 +125,8 @@ INTRINSICS = "fx", "fy", "cx", "cy"
 def read(path: Path | str, needs_camera: bool = True) -> Instrument:
     """Read an Instrument from its YAML file; InstrumentError says why a file cannot be used.
 
-    Of RMS's platepar and `.config` it is the camera alone (platepar.py). The format of others:
-
-    starpos_instrument: 1
-    camera: {focal_mm, pixel_um}, {focal_px} or {width, height, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3]}
-            or camera.yaml, or {calibration: camera.yaml}, a CameraInfo calibration file next to this one or at a full
-            path; each of the first three may have `model: equidistant`, of a fisheye, whose distortion is
-            [k1, k2, k3, k4], and the first two width and height: of the whole frame, in whose middle the optical axis is,
-            and to which A3 belongs
-    misalignment_deg: [rx, ry, rz]                       without one of the next two it is not known: 10 deg
-    calibration_stddev_arcsec: [x, y, z]                 about the inclinometer's axes, or as
-    calibration_covariance_arcsec2: [[..], [..], [..]]
-    calibrated: {utc, temperature_c, tilt_deg, frames, valid_days, response, response_covariance}
-                                                         which `starpos calibrate` writes
-    remounted_arcsec: 0                                  1 sigma of A3's turn since the two were put together again
-    link_to_camera: [[..], [..], [..]]
-    link_to_camera_stddev_arcsec: 0                      1 sigma of it about each axis
-    inclinometer: {model: scl3300}                       fills the tilt_* keys that the file leaves out (sensors.py)
-    tilt_noise_deg: 0.0035                               for one reading; the others are errors of zero and scale
-    tilt_quantum_deg: 0.0005
-    tilt_drift_arcsec_per_sqrt_hour: 2
-    tilt_temperature_arcsec_per_c: 3
-    tilt_scale: 1e-4
-    tilt_cross: 0                                        share of one axis' angle that the other shows
-    tilt_pose_arcsec: 0                                  new at each pose: hysteresis, nonlinearity, flexure
-    tilt_range_deg: 90
-    clock_stddev_s: 0.1
-    shutter: {readout_s: 0.03, readout_stddev_s: 0}      from the row read first to the last; negative: bottom row first
-    vertical: {camera_to_itrs, covariance_arcsec2, sag_arcsec_per_sqrt_hour}
-                                                         of a camera fixed to the ground, in place of tilt_...
+    Of RMS's platepar and `.config` it is the camera alone (platepar.py). docs/reference/files.md#the-instrument has the
+    keys of the format, their units, and what they are in a file that leaves them out.
 
     Parameters
     ----------
@@ -187,7 +153,7 @@ def read(path: Path | str, needs_camera: bool = True) -> Instrument:
         )
     try:
         return _from_mapping(content, path.parent, needs_camera)
-    except InstrumentError as e:
+    except (InstrumentError, FrameError) as e:
         raise InstrumentError(f"{path}: {e}") from None
 
 
@@ -273,10 +239,7 @@ def _from_mapping(content: dict, folder: Path, needs_camera: bool) -> Instrument
     sensor, errors = _sensor(content, bool(given))
     more = _told(content, INSTRUMENT)
     if "shutter" in content:
-        try:
-            more["shutter"] = Shutter(**_told(_mapping(content, "shutter", SHUTTER), SHUTTER, needed=True))
-        except FrameError as e:
-            raise InstrumentError(str(e)) from None
+        more["shutter"] = Shutter(**_told(_mapping(content, "shutter", SHUTTER), SHUTTER, needed=True))
     instrument = Instrument(
         **optics,
         calibration=_calibration(content),
@@ -422,16 +385,12 @@ def _row(mapping: dict, key: str) -> tuple[float, ...]:
     )
 
 
-def _matrix(mapping: dict, key: str) -> tuple:
-    rows = _list(mapping, key, "three rows of three numbers")
-    matrix = tuple(_row({key: row}, key) for row in rows) if len(rows) == 3 else ()
-    if {len(row) for row in matrix} != {3}:
-        raise InstrumentError(f"{key} is {_short(rows)}: give three rows of three numbers")
-    return matrix
-
-
 def _square(mapping: dict, key: str) -> tuple:
-    return tuple(_row({key: row}, key) for row in _list(mapping, key, "rows of numbers"))
+    rows = _list(mapping, key, "rows of numbers")
+    matrix = tuple(_row({key: row}, key) for row in rows)
+    if {len(row) for row in matrix} - {len(rows)}:
+        raise InstrumentError(f"{key} is {_short(rows)}: give as many numbers in each row as there are rows")
+    return matrix
 
 
 def _count(mapping: dict, key: str) -> int:
@@ -451,7 +410,7 @@ def _error(mapping: dict, key: str, unit: float) -> float:
 
 
 # of A3, of how it was found, of the rest, of a shutter, and of a fixed camera's vertical
-CALIBRATION: Schema = {"misalignment_deg": _row, COVARIANCE: _matrix, "remounted_arcsec": _number}
+CALIBRATION: Schema = {"misalignment_deg": _row, COVARIANCE: _square, "remounted_arcsec": _number}
 CALIBRATED: Schema = {
     "temperature_c": _number,
     "tilt_deg": _row,
@@ -460,9 +419,9 @@ CALIBRATED: Schema = {
     "response": _row,
     "response_covariance": _square,
 }
-INSTRUMENT: Schema = {"link_to_camera": _matrix, LINK_STDDEV: _number, "clock_stddev_s": _number}
+INSTRUMENT: Schema = {"link_to_camera": _square, LINK_STDDEV: _number, "clock_stddev_s": _number}
 SHUTTER: Schema = {"readout_s": _number, "readout_stddev_s": _number}
-VERTICAL: Schema = {"camera_to_itrs": _matrix, "covariance_arcsec2": _matrix}
+VERTICAL: Schema = {"camera_to_itrs": _square, "covariance_arcsec2": _square}
 SAG = "sag_arcsec_per_sqrt_hour"
 KEYS = ("camera", *CALIBRATION_KEYS[:4], "remounted_arcsec", *tuple(INSTRUMENT)[:2], "inclinometer", *INCLINOMETER,
         "clock_stddev_s", "shutter", "vertical")  # fmt: skip

@@ -24,7 +24,6 @@ from starpos.instrument.inclinometer import (
     InclinometerErrors,
     Tilt,
     level_of,
-    levelling_of,
     up_of,
     up_slope,
 )
@@ -98,7 +97,7 @@ class LocalLevel:
     @cached_property
     def turns(self) -> np.ndarray:
         """Matrix (3, 3) from a change of up (3,) in S to a small rotation (3,) of L about its axes; zero about Z."""
-        return levelling_of(self.a2)
+        return np.array([self.a2[1], -self.a2[0], np.zeros(3)])
 
 
 @at_once

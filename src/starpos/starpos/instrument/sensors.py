@@ -3,8 +3,8 @@
 
 What a sheet states becomes 1 sigma by one rule. A standard deviation, an rms and a typical value count as they are.
 Murata's minimum and maximum are 3 sigma, as its sheets say. Another limit (a maximum, "<", the largest deviation from a
-straight line) is a uniform distribution: `limit`. A noise density becomes the noise behind a filter of first order:
-`rms`.  The figures are in data/sensors.csv.
+straight line) is a uniform distribution (GUM, 4.3.7). A noise density per sqrt(Hz) becomes the noise behind a filter of
+first order.  The figures are in data/sensors.csv.
 """
 
 from collections.abc import Mapping
@@ -25,22 +25,12 @@ UNITS = {"": 1.0, "deg": radians(1), "arcsec": ARCSEC, "mrad": 1e-3, "mg": 1e-3}
 FIRST_ORDER = 1.57
 
 
-def limit(most: float) -> float:
-    """Standard deviation of a uniform distribution within +-most (GUM, 4.3.7)."""
-    return most / sqrt(3)
-
-
-def rms(density: float, bandwidth_hz: float) -> float:
-    """Noise of one reading from its density per sqrt(Hz) and its filter's -3 dB bandwidth."""
-    return density * sqrt(FIRST_ORDER * bandwidth_hz)
-
-
 def _sigma(row: Mapping[str, str]) -> float:
     """1 sigma of a row of the table, in rad or as a share."""
     stated = float(row["value"]) * UNITS[row["unit"]] / float(row["over"] or 1)
     if row["rule"] == "density":
-        return rms(stated, float(row["hz"]))
-    return {"": stated, "limit": limit(stated), "three": stated / 3}[row["rule"]]
+        return stated * sqrt(FIRST_ORDER * float(row["hz"]))
+    return stated / {"": 1, "limit": sqrt(3), "three": 3}[row["rule"]]
 
 
 SCA100T_CALIBRATED = InclinometerErrors()

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A zenith camera's session at a mark, from its frames and tilts: the deflection of the vertical."""
 
-import os
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from starpos.earth.place import Place
@@ -14,37 +12,33 @@ from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver, check_explained
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument import instrument_file
-from starpos.instrument.instrument import Instrument, with_frame_size
-from starpos.instrument.tilt_log import Tilts
-from starpos.night.reading import First, Instruments, Reader, TiltFile
-from starpos.night.work import OnFile, Solving
+from starpos.instrument.instrument import Instrument
+from starpos.night.opening import work_of
+from starpos.night.reading import Instruments, Reader
+from starpos.night.work import Solving
+from starpos.parallel.processes import Here
 from starpos.sky import catalogue
 from starpos.zenith.adjustment import DeflectionSession
 from starpos.zenith.doubts import checked_session
 from starpos.zenith.sighting import ZenithSighting, sighting
 
 
-@dataclass(frozen=True)
-class ZenithSighted:
-    """Makes the ZenithSighting of a frame at a mark; a frame's fault is a Solution that gives the reason."""
+def zenith_seen(given: Solving, mark: Place, item: Frame | Stars) -> ZenithSighting | Solution:
+    """The sighting of a frame at a mark, identified by every way there is, with the instruments, tilts and air given.
 
-    instruments: Instruments
-    atmosphere: Atmosphere
-    tilts: Tilts
-    mark: Place
-
-    def __call__(self, item: Frame | Stars) -> ZenithSighting | Solution:
-        """The sighting of a frame, identified by every way there is."""
-        sight = Solving(self.instruments)(item)
-        instrument = sight.instrument or self.instruments.of(item)
-        if sight.found is None or instrument is None:
-            return sight.solution
-        solver = Solver(instrument, catalogue.load_catalogue(), self.atmosphere)
-        try:
-            check_explained(sight.solution)
-            return sighting(solver, sight.stars, sight.found, self.mark, self.tilts)
-        except StarposError as error:
-            return Solution.refused(sight.stars, error)
+    A frame's fault is a Solution that gives the reason.
+    """
+    sight = Solving(given.instruments)(item)
+    instrument = sight.instrument or given.instruments.of(item)
+    if sight.found is None or instrument is None:
+        return sight.solution
+    assert given.tilts is not None
+    solver = Solver(instrument, catalogue.load_catalogue(), given.atmosphere)
+    try:
+        check_explained(sight.solution)
+        return sighting(solver, sight.stars, sight.found, mark, given.tilts)
+    except StarposError as error:
+        return Solution.refused(sight.stars, error)
 
 
 def deflection(
@@ -85,16 +79,13 @@ def deflection(
     known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
     air = Atmosphere.measured(None, None) if atmosphere is None else atmosphere
     read, paths = Reader(), tuple(map(str, frames))
-    first = First(read)(paths)
+    first = read.first(paths)
     if first is None:
         raise FrameError(f"none of the {len(paths)} frames can be read: give frames or lists of stars")
-    framed, _ = with_frame_size(known, first)
-    log = TiltFile(os.path.abspath(tilt), framed.inclinometer.noise_rad)
+    given, _ = work_of(Instruments(known), first, Path(tilt), air)
+    assert given.instruments.instrument is not None
     mark = Place.on_ellipsoid(site[0], site[1], height_m=site[2])
-    work = OnFile(read, ZenithSighted(Instruments(framed), air, log, mark))
-    sightings = []
-    for path in paths:
-        with suppress(FrameError):
-            answer = work(path)
-            sightings += [answer] if isinstance(answer, ZenithSighting) else []
-    return checked_session(sightings, framed, air, mark)
+    work = partial(read.on, partial(zenith_seen, given, mark))
+    answers = Here().map((work, path) for path in paths)
+    sightings = [answer for answer in answers if isinstance(answer, ZenithSighting)]
+    return checked_session(sightings, given.instruments.instrument, air, mark)

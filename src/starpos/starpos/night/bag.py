@@ -2,6 +2,7 @@
 """A night in a rosbag2: the stars and tilts of one instrument, or of a robot's own camera and IMU, to be solved."""
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,6 @@ from starpos.messages.tilt import UNUSABLE, message_to_tilt
 from starpos.night.night import Truth
 from starpos.night.opening import truth_in
 from starpos.night.reading import Instruments
-from starpos.night.remarks import Remark
 from starpos.night.solving import Exposures, Worked
 from starpos.night.work import Solving
 from starpos.progress import Progress
@@ -51,7 +51,7 @@ class Recorded:
     tilts: TiltLog | None
     star_count: int
     truth: Truth | None
-    remarks: tuple[Remark, ...]
+    remarks: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -74,24 +74,50 @@ def read(
     namespace: the instrument's; None where there is only one.  tilt_noise_rad: sigma of readings that state none.
     Raises BagError if the bag cannot be read, FrameError if the instrument is not in it.
     """
+    messages, cameras, why_no_camera = DriverMessages(drivers), dict[tuple[int, int], Camera](), ""
+    tilts: list[Tilt] = []
+    unusable = 0
     with BagReader(path, typed=True) as bag:
         chosen = instrument_in(bag, namespace, INPUTS, drivers.remaps)
-        reading = _Reading(tilt_noise_rad, DriverMessages(drivers))
         wanted = [c for c in chosen.connections if c.msgtype not in WITH_STARS]
         total = sum(c.msgcount for c in wanted) or 1
         for done, (connection, log_ns, message) in enumerate(bag.decoded(wanted), 1):
-            reading.read_message(connection.msgtype, message, log_ns * 1e-9)
             if done % 500 == 0 or done == total:
                 progress(path.name[:20], done / total)
+            if connection.msgtype == CAMERA_INFO:
+                try:
+                    camera = message_to_camera(message, "its camera_info")
+                    cameras.setdefault((camera.width, camera.height), camera)
+                except InstrumentError as error:
+                    why_no_camera = str(error)
+                continue
+            if connection.msgtype == IMU:
+                message = messages.tilt_of(message, log_ns * 1e-9)
+            if connection.msgtype not in (IMU, TILT) or message is None:
+                continue
+            # an impossible tilt only leads to a remark
+            with suppress(TiltError):
+                tilt = message_to_tilt(message, tilt_noise_rad)
+                if not message.flags & UNUSABLE:
+                    tilts.append(tilt)
+                    continue
+            unusable += 1
+        remarks = (
+            f"{path.name}: {chosen.made}" if chosen.made else "",
+            *messages.remarks(),
+            f"{unusable} tilts of the bag were left out: flagged, out of range or broken" if unusable else "",
+            f"{path.name}: {why_no_camera}" if why_no_camera and not cameras else "",
+        )
+        tilts.sort(key=lambda tilt: tilt.utc_unix_s)
         return Recorded(
             path=path,
             namespace=chosen.namespace,
             drivers=drivers,
-            cameras=reading.cameras,
-            tilts=reading.tilt_log(),
+            cameras=cameras,
+            tilts=TiltLog.of_readings(tilts) if tilts else None,
             star_count=sum(c.msgcount for c in chosen.connections if c.msgtype in WITH_STARS),
             truth=truth_in(path) if path.is_dir() else None,
-            remarks=reading.remarks(path, chosen.made),
+            remarks=tuple(filter(None, remarks)),
         )
 
 
@@ -120,56 +146,6 @@ def _named_stars(kind: str, message: Any, messages: DriverMessages) -> tuple[str
     except StarposError as error:
         # the error of a list names it
         return name, FrameError(f"{error}" if kind == STARS else f"{name}: {error}")
-
-
-class _Reading:
-    """Collects the messages of one instrument."""
-
-    def __init__(self, tilt_noise_rad: float, messages: DriverMessages):
-        self.cameras: dict[tuple[int, int], Camera] = {}
-        self._unknown_stddev_rad, self._messages = tilt_noise_rad, messages
-        self._tilts: list[Tilt] = []
-        self._unusable = 0
-        self._why_no_camera = ""
-
-    def read_message(self, kind: str, message: Any, log_s: float) -> None:
-        """Read a message of a type; an impossible tilt or camera only leads to a remark."""
-        if kind == IMU:
-            kind, message = TILT, self._messages.tilt_of(message, log_s)
-            if message is None:
-                return
-        if kind == TILT:
-            tilt: Tilt | None
-            try:
-                tilt = message_to_tilt(message, self._unknown_stddev_rad)
-            except TiltError:
-                tilt = None
-            if tilt is None or message.flags & UNUSABLE:
-                self._unusable += 1
-            else:
-                self._tilts.append(tilt)
-        elif kind == CAMERA_INFO:
-            try:
-                camera = message_to_camera(message, "its camera_info")
-                self.cameras.setdefault((camera.width, camera.height), camera)
-            except InstrumentError as error:
-                self._why_no_camera = str(error)
-
-    def tilt_log(self) -> TiltLog | None:
-        """The usable tilts; None without any."""
-        in_time = sorted(self._tilts, key=lambda tilt: tilt.utc_unix_s)
-        return TiltLog.of_readings(in_time) if in_time else None
-
-    def remarks(self, path: Path, made: str) -> tuple[Remark, ...]:
-        """Remarks on left-out messages, and on how a robot's own messages were used."""
-        said = [Remark(f"{path.name}: {made}")] if made else []
-        said += [Remark(sentence) for sentence in self._messages.remarks()]
-        if self._unusable:
-            sentence = f"{self._unusable} tilts of the bag were left out: flagged, out of range or broken"
-            said.append(Remark(sentence))
-        if self._why_no_camera and not self.cameras:
-            said.append(Remark(f"{path.name}: {self._why_no_camera}"))
-        return tuple(said)
 
 
 def exposures(r: Recorded, instruments: Instruments, atmosphere: Atmosphere, vertical: Vertical) -> Exposures:

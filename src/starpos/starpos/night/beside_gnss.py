@@ -14,15 +14,6 @@ from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssWatch
 from starpos.instrument.tilt_log import Tilts
-from starpos.night.remarks import Remark
-
-
-@dataclass(frozen=True)
-class Receiver:
-    """The GNSS places of a night, and what earlier nights learned of the instrument; None where nothing."""
-
-    track: GnssTrack
-    learned: Learned | None = None
 
 
 @dataclass(frozen=True)
@@ -31,24 +22,29 @@ class WatchedNight:
 
     answers: tuple[Watched, ...]
     learned: Learned | None
-    remarks: tuple[Remark, ...]
+    remarks: tuple[str, ...]
 
 
 def watched_night(
-    solver: Solver, sights: Sequence[Sight], tilts: Tilts | None, receiver: Receiver, vertical: Vertical
+    solver: Solver,
+    sights: Sequence[Sight],
+    tilts: Tilts | None,
+    track: GnssTrack,
+    before: Learned | None,
+    vertical: Vertical,
 ) -> WatchedNight:
     """Solve a night's frames, which are identified already, in the order of their times.
 
-    tilts: None where headings alone are wanted.
+    tilts: None where headings alone are wanted.  before: what earlier nights learned of the instrument.
     """
-    watch = GnssWatch(solver.instrument, vertical, receiver.learned)
+    watch = GnssWatch(solver.instrument, vertical, before)
     said: Counter[str] = Counter()
     answers: dict[int, Watched] = {}
     for k in sorted(range(len(sights)), key=lambda k: sights[k].stars.mid_unix_s or 0.0):
         stars, rough, gnss = sights[k].stars, sights[k].solution, None
         if stars.mid_unix_s is not None:
             try:
-                gnss = receiver.track.at(stars.mid_unix_s)
+                gnss = track.at(stars.mid_unix_s)
             except GnssError as error:
                 said[str(error)] += 1
         if rough.found is not None and tilts is not None:
@@ -58,5 +54,5 @@ def watched_night(
         if gnss is not None:
             rough = placed(solver, stars, rough, gnss.deflected(vertical))
         answers[k] = watched(solver, stars, rough, gnss, watch)
-    remarks = tuple(Remark(f"{number} frames: {why}") for why, number in said.items())
+    remarks = tuple(f"{number} frames: {why}" for why, number in said.items())
     return WatchedNight(tuple(answers[k] for k in range(len(sights))), watch.learned, remarks)

@@ -2,7 +2,6 @@
 """The horizon of a camera that stands still, learned from where bright stars never are: trees, houses, hills."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -30,21 +29,12 @@ AS_LIKELY = 2.0
 TABLE = TableForm(what="table of a horizon", error=FrameError, needed=("azimuth_deg", "altitude_deg"))
 
 
-@dataclass(frozen=True, eq=False)
-class Expected:
-    """Azimuth and altitude (N,) of bright stars that a frame may show, in deg, and whether they were identified (N,).
+def expected(sight: Sight, camera: Camera, catalogue: Catalogue) -> np.ndarray:
+    """The bright stars (4, N) above the level horizon on a frame whose attitude at a known place is known.
 
-    margin_mag (N,): by how much each would be brighter at the zenith than the faintest identified ones.
+    Azimuth and altitude in deg, whether they were identified, and by how much each would be brighter at the zenith than
+    the faintest identified ones, mag.
     """
-
-    azimuth_deg: np.ndarray
-    altitude_deg: np.ndarray
-    seen: np.ndarray
-    margin_mag: np.ndarray
-
-
-def expected(sight: Sight, camera: Camera, catalogue: Catalogue) -> Expected:
-    """The bright stars above the level horizon on a frame whose attitude at a known place is known."""
     at, found = sight.solution.at_place, sight.found
     assert at is not None and found is not None
     state, to_local = earth_state(at.utc_unix_s), at.place.plumb_axes
@@ -57,22 +47,21 @@ def expected(sight: Sight, camera: Camera, catalogue: Catalogue) -> Expected:
     v, rows = v[on], rows[on]
     azimuth, altitude = np.arctan2(v[:, 0], v[:, 1]), np.arcsin(v[:, 2])
     seen, margin = np.isin(rows, found.catalogue), limit - catalogue.vmag(rows)
-    return Expected(np.degrees(azimuth) % 360, np.degrees(altitude), seen, margin)
+    return np.array([np.degrees(azimuth) % 360, np.degrees(altitude), seen, margin])
 
 
-def horizon(stars: Sequence[Expected], extinction: float = np.nan) -> np.ndarray:
+def horizon(stars: Sequence[np.ndarray], extinction: float = np.nan) -> np.ndarray:
     """Azimuths and altitudes (PARTS, 2) of the horizon, deg; NaN where too few stars have passed.
 
+    stars: of each frame, as `expected` has them.
     extinction: in mag per air mass, by which low stars are fainter; NaN: unknown, then haze is assumed.
     In each part of the azimuths it is the lowest altitude that divides stars that are seen from those that are not nearly
     as well as the best.
     """
-    azimuth, altitude, seen, margin = (
-        np.concatenate([getattr(s, f.name) for s in stars]) for f in fields(Expected)
-    )
+    azimuth, altitude, seen, margin = np.concatenate(stars, axis=1)
     dimmed = (HAZE if np.isnan(extinction) else extinction) * (air_mass(altitude) - 1)
     bright = margin - dimmed > SURELY_SEEN_MAG
-    azimuth, altitude, seen = azimuth[bright], altitude[bright], seen[bright]
+    azimuth, altitude, seen = azimuth[bright], altitude[bright], seen[bright] > 0
     width = 360 / PARTS
     middles = (np.arange(PARTS) + 0.5) * width
     found = np.full(PARTS, np.nan)

@@ -2,9 +2,9 @@
 """A night: its frames, the answer of each, and their average."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from starpos.fix.fix import InDegrees, PlaceFix
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import FieldPointing, Solution, Status
 from starpos.frames.frame import Stars
-from starpos.night.remarks import Remark
 
 if TYPE_CHECKING:
     from starpos.night.beside_gnss import WatchedNight
@@ -72,11 +71,24 @@ class Shot:
     @classmethod
     def of(cls, name: str, s: Solution, stars: Stars | None) -> "Shot":
         """The part of a solution that is shown; stars: its stars, None for a frame that cannot be read."""
-        shot = cls(
+        told: dict[str, Any] = {}
+        if s.pointing:
+            told["residual_arcsec"] = s.pointing.residual_arcsec
+        if stars is not None and s.star is not None and s.magnitudes is not None:
+            told |= {
+                "xy": np.stack([stars.x, stars.y], -1)[s.star],
+                "magnitudes": s.magnitudes,
+                "names": s.names,
+            }
+        if s.fix is not None:
+            told |= {"residual_px": -s.fix.residual_px, "residual_arcsec": s.fix.residual_arcsec}
+            told["camera_to_itrs"] = s.fix.camera.rotation
+        return cls(
             name=name,
             status=s.status,
             message=s.message,
             utc_unix_s=float("nan") if s.utc_unix_s is None else s.utc_unix_s,
+            place=s.fix,
             pointing=s.pointing,
             size=None if stars is None else (stars.width, stars.height),
             stars_detected=s.stars_detected,
@@ -84,22 +96,9 @@ class Shot:
             tilt=(s.tilt.theta_x, s.tilt.theta_y) if s.tilt else NO_TILT,
             identify_s=s.identify_s,
             fix_s=s.fix_s,
-            residual_arcsec=s.pointing.residual_arcsec if s.pointing else float("nan"),
             at_place=s.at_place,
             warnings=s.warnings,
-        )
-        if stars is not None and s.star is not None and s.magnitudes is not None:
-            shot = replace(
-                shot, xy=np.stack([stars.x, stars.y], -1)[s.star], magnitudes=s.magnitudes, names=s.names
-            )
-        if s.fix is None:
-            return shot
-        return replace(
-            shot,
-            place=s.fix,
-            residual_px=-s.fix.residual_px,
-            residual_arcsec=s.fix.residual_arcsec,
-            camera_to_itrs=s.fix.camera.rotation,
+            **told,
         )
 
     def __repr__(self) -> str:
@@ -162,7 +161,7 @@ class Night:
     truth: Truth | None = None
     steady: np.ndarray | None = None
     watched: "WatchedNight | None" = None
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def simulated(self) -> bool:

@@ -5,6 +5,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,10 +26,10 @@ from starpos.instrument.instrument import ByGravity, Calibration, Instrument
 from starpos.instrument.phone_log import is_phone_log
 from starpos.instrument.tilt_log import Tilts, TiltsByTime
 from starpos.night.night import Night, Truth
-from starpos.night.reading import About, First, Instruments, Reader, TiltFile
-from starpos.night.remarks import Remark, of_gravity, of_tilts
+from starpos.night.reading import Instruments, Reader, TiltFile
+from starpos.night.remarks import of_gravity, of_tilts
 from starpos.night.solving import Exposures, How, Worked, solved_night
-from starpos.night.work import OnFile, Solving
+from starpos.night.work import Solving
 from starpos.parallel.processes import Here
 from starpos.progress import Progress, quiet
 
@@ -64,18 +65,19 @@ def exposures(
         # a new reader, which has not kept a frame without its time
         tilts, read = ByGravity(), Reader(read.clock or CameraClock(), read.delay_s)
     by_gravity = isinstance(tilts, ByGravity)
-    first = First(read, by_gravity)(tuple(map(str, frames)))
-    work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[Remark, ...]()
+    first = read.first(list(map(str, frames)), by_gravity)
+    work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[str, ...]()
     if first is not None:
         try:
             work, remarks = work_of(given, first, tilts, atmosphere, place)
         except TiltError as error:
             none = place is not None and not (folder / TILTS).exists()
-            instruments, remarks = given.framed(first)
+            instruments, doubt = given.framed(first)
+            remarks = (doubt,) if doubt else ()
             work = replace(work, instruments=instruments, tilts=None if none else TiltsByTime(why=str(error)))
 
     def each(work: Callable[[Frame | Stars], Any]) -> Worked:
-        answers = Here().map((OnFile(read, work), str(path)) for path in frames)
+        answers = Here().map((partial(read.on, work), str(path)) for path in frames)
         return zip((path.name for path in frames), answers, strict=True)
 
     kind = "lists of stars" if frames[0].suffix == ".csv" else "frames"
@@ -93,17 +95,17 @@ def exposures(
 
 def work_of(
     given: Instruments,
-    first: About,
+    first: Stars,
     tilts: Path | ByGravity | None,
     atmosphere: Atmosphere,
     place: Place | None = None,
-) -> tuple[Solving, tuple[Remark, ...]]:
+) -> tuple[Solving, tuple[str, ...]]:
     """The work on the frames of a night whose first one is known, and what looks wrong.
 
     tilts: their table, or that photographs have their own; None where none is needed.  Raises TiltError if the table
     cannot be read.
     """
-    known, own = given.instrument, tuple[Remark, ...]()
+    known, said = given.instrument, list[str]()
     by_log = isinstance(tilts, Path) and is_phone_log(tilts) and first.upper_edge is not None
     # a telephone's log has its camera's axes, unless another A3 is stated
     by_log = by_log and (known is None or known.calibration.unknown)
@@ -111,8 +113,8 @@ def work_of(
         model = PHONE if by_log or first.gravity is None else first.gravity.model
         known = None if known is None else known.levelled_by(model)
         if known is not None and (by_log or first.gravity is not None):
-            own = of_gravity(known, by_log)
-    instruments, remarks = replace(given, instrument=known).framed(first)
+            said.append(of_gravity(known, by_log))
+    instruments, doubt = replace(given, instrument=known).framed(first)
     level: Tilts | None = None if isinstance(tilts, Path) else tilts
     if isinstance(tilts, ByGravity) and first.gravity is not None:
         level = replace(tilts, camera=first.gravity.camera)
@@ -120,9 +122,10 @@ def work_of(
         known = instruments.instrument
         errors = sensors.unnamed() if known is None else known.inclinometer
         table = TiltFile(os.path.abspath(tilts), errors.noise_rad)
-        own = (*own, *of_tilts(table.log, str(tilts), errors))
+        said.append(of_tilts(table.log, str(tilts), errors))
         level = ByGravity(table) if by_log else table
-    return Solving(instruments, atmosphere=atmosphere, tilts=level, places=place), (*own, *remarks)
+    work = Solving(instruments, atmosphere=atmosphere, tilts=level, places=place)
+    return work, tuple(filter(None, (*said, doubt)))
 
 
 def frames_in(folder: Path) -> list[Path]:
@@ -195,13 +198,7 @@ def truth_in(folder: Path) -> Truth | None:
 
 @dataclass(frozen=True)
 class NightOnDisk:
-    """A folder of frames with tilt.csv, its instrument and air as far as known; `solve` solves it.
-
-    Attributes
-    ----------
-    instrument : None if the frames' headers have the focal length
-    calibration : A3 in place of the instrument's
-    inclinometer : name of its model in place of the instrument's; '' for the instrument's
+    """A folder of frames with tilt.csv, its instrument and air as far as `open_night` was told; `solve` solves it.
 
     Examples
     --------
@@ -241,7 +238,7 @@ class NightOnDisk:
         """
         given, sought = self.instrument, False
         if given is None:
-            first = First(Reader())(tuple(map(str, frames_in(self.folder))))
+            first = Reader().first(list(map(str, frames_in(self.folder))))
             # each frame's own counts; without any, the frame says so
             given = None if first is None or first.focal_px is None else Instrument(first.focal_px)
             if sought := first is not None and first.focal_px is None and first.gravity is not None:
@@ -252,15 +249,13 @@ class NightOnDisk:
             model, errors = sensors.find(self.inclinometer)
             given = replace(given, inclinometer=errors, inclinometer_model=model)
         instruments = Instruments(given, by_header=self.instrument is None, sought=sought)
-        receiver = None
-        if gnss is not None:
+        if isinstance(gnss, (str, Path)):
             from starpos.gnss.receiver import read_gnss_csv
-            from starpos.night.beside_gnss import Receiver
 
-            receiver = Receiver(read_gnss_csv(gnss)[0] if isinstance(gnss, (str, Path)) else gnss)
+            gnss, _ = read_gnss_csv(gnss)
         return solved_night(
             exposures(self.folder, instruments, self.atmosphere, self.vertical, self.place),
-            How(turn_stddev_deg if self_calibrate else None, receiver),
+            How(turn_stddev_deg if self_calibrate else None, gnss),
             progress,
         )
 

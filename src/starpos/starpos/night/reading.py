@@ -3,24 +3,23 @@
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from starpos.errors import FrameError
 from starpos.fix.fix import IDEAL
 from starpos.frames.exif import CameraClock
-from starpos.frames.frame import Frame, Stars
-from starpos.frames.gravity import Gravity
+from starpos.frames.frame import Frame, Stars, no_stars
 from starpos.frames.reading import read_frame
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument, with_frame_size
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
-from starpos.night.remarks import Remark
 
 
 @dataclass(frozen=True)
@@ -44,10 +43,26 @@ class Reader:
         stamp_s = math.hypot(item.stamp_stddev_s, stddev_s)
         return replace(item, mid_unix_s=item.mid_unix_s + late_s, stamp_stddev_s=stamp_s)
 
-    def keep(self, path: str, item: Frame | Stars) -> None:
-        """Keep a frame for the next call with its path."""
-        self._kept.clear()
-        self._kept[path] = item
+    def first(self, paths: Sequence[str], levelled: bool = False) -> Stars | None:
+        """What the first frame that can be read states of itself, without its stars; None if none can be read.
+
+        levelled: rather of the first one that has gravity.
+        """
+        first = None
+        for path in paths:
+            with suppress(FrameError):
+                item = self(path)
+                self._kept.clear()
+                self._kept[path] = item
+                about = no_stars(item.width, item.height, **item.facts)
+                if not levelled or item.gravity is not None:
+                    return about
+                first = first or about
+        return first
+
+    def on(self, work: Callable[[Frame | Stars], Any], path: str) -> Any:
+        """What a work makes of the frame or list in a file."""
+        return work(self(path))
 
     def __reduce__(self) -> tuple[type["Reader"], tuple[CameraClock | None, tuple[float, float]]]:
         return Reader, (self.clock, self.delay_s)
@@ -62,51 +77,8 @@ def stars_of(item: Frame | Stars) -> Stars:
     return detect_dark_too(item).stars
 
 
-@dataclass(frozen=True)
-class About:
-    """Frame size, focal length, place on the sensor in px, gravity and upper edge, as a first frame states them."""
-
-    width: int
-    height: int
-    _: KW_ONLY
-    focal_px: float | None
-    origin_px: tuple[float, float] | None = None
-    gravity: Gravity | None = None
-    upper_edge: tuple[int, int] | None = None
-
-
 # for pointings only the camera's axes count
-NO_CAMERA = About(IDEAL.width, IDEAL.height, focal_px=IDEAL.fx)
-
-
-@dataclass(frozen=True)
-class First:
-    """Finds the About of the first of several frames that can be read; None if none can.
-
-    levelled: rather of the first one that has gravity.
-    """
-
-    read: Reader
-    levelled: bool = False
-
-    def __call__(self, paths: tuple[str, ...]) -> About | None:
-        first = None
-        for path in paths:
-            with suppress(FrameError):
-                item = self.read(path)
-                self.read.keep(path, item)
-                about = About(
-                    item.width,
-                    item.height,
-                    focal_px=item.focal_px,
-                    origin_px=item.origin_px,
-                    gravity=item.gravity,
-                    upper_edge=item.upper_edge,
-                )
-                if not self.levelled or item.gravity is not None:
-                    return about
-                first = first or about
-        return first
+NO_CAMERA = no_stars(IDEAL.width, IDEAL.height, focal_px=IDEAL.fx)
 
 
 @dataclass(frozen=True)
@@ -126,13 +98,13 @@ class Instruments:
     any_size: bool = True
     sought: bool = False
 
-    def framed(self, first: About) -> tuple["Instruments", tuple[Remark, ...]]:
-        """Instruments of a night with this first frame, and a remark if the optical axis of its frames is not known."""
+    def framed(self, first: Frame | Stars) -> tuple["Instruments", str]:
+        """Instruments of a night with this first frame, and a remark if the axis of its frames is not known, else ''."""
         # a lens that is sought may be another one in each frame
         if self.instrument is None or self.sought:
-            return self, ()
+            return self, ""
         instrument, doubt = with_frame_size(self.instrument, first)
-        return replace(self, instrument=instrument), (Remark(doubt),) if doubt else ()
+        return replace(self, instrument=instrument), doubt
 
     def of(self, frame: Frame | Stars) -> Instrument | None:
         """The instrument of a frame; None if its focal length is unknown."""

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Remarks on a night, each a sentence; among them doubts: mistaken tilts, a place far from the stated one."""
+"""Remarks on a night, each a sentence; among them doubts: mistaken tilts, a place far from the stated one.
+
+A remark begins with a small letter and ends without a full stop; it is '' where there is nothing to say.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -35,38 +38,27 @@ TABLE_COSINE, TABLE_GAP_RAD = float(np.cos(np.radians(5.0))), np.radians(190.0)
 WORTH_SAVING_ARCSEC = 600.0
 
 
-class Remark(str):
-    """A sentence about a night, which begins with a small letter and ends without a full stop."""
-
-
-def of_tilts(log: TiltLog, path: str, inclinometer: InclinometerErrors) -> tuple[Remark, ...]:
+def of_tilts(log: TiltLog, path: str, inclinometer: InclinometerErrors) -> str:
     """Say that a table of tilts is rounded to coarser steps than the inclinometer's; TiltError if it is in radians."""
     if radians := like_radians(log):
         raise TiltError(f"{path}: {radians}")
     coarser = inclinometer.coarser(log.step_rad)
-    return (Remark(f"{path}: {coarser}"),) if coarser else ()
+    return f"{path}: {coarser}" if coarser else ""
 
 
-def of_inclinometer(instrument: Instrument, ways: str = checks.MODEL_BY_OPTIONS) -> tuple[Remark, ...]:
-    """Say that the inclinometer's model is not stated; ways: what to do then."""
-    sentence = checks.unnamed_inclinometer(instrument, ways)
-    return (Remark(sentence),) if sentence else ()
-
-
-def of_gravity(instrument: Instrument, by_log: bool = False) -> tuple[Remark, ...]:
+def of_gravity(instrument: Instrument, by_log: bool = False) -> str:
     """Say what a place by photographs rests on; instrument: with their level.  by_log: a telephone's log is it."""
     if not instrument.has_level_inside:
-        return ()
+        return ""
     level = "felt by the telephone" if instrument.inclinometer_model == PHONE else "by the camera's level"
     where = "the telephone's log, as the camera's own" if by_log else f"the gravity in the files, {level}"
-    sentence = f"the level is {where}; time, zone and lens are the files', and their GPS is only compared"
-    return (Remark(sentence),)
+    return f"the level is {where}; time, zone and lens are the files', and their GPS is only compared"
 
 
-def of_marks(place: Fix | Average, marks_deg: Sequence[tuple[float, float]]) -> tuple[Remark, ...]:
+def of_marks(place: Fix | Average, marks_deg: Sequence[tuple[float, float]]) -> str:
     """Compare a place with the first of those that GPS wrote into the frames' files, deg on WGS 84."""
     if not marks_deg:
-        return ()
+        return ""
     mark = Near(*np.radians(marks_deg[0]).tolist())
     off = np.array([half_turn(place.longitude - mark.longitude), place.latitude - mark.latitude])
     off *= EARTH_RADIUS_M * np.array([np.cos(mark.latitude), 1.0])
@@ -74,23 +66,23 @@ def of_marks(place: Fix | Average, marks_deg: Sequence[tuple[float, float]]) -> 
     km = mark.km_from(place.latitude, place.longitude)
     told = f"the place is {km:.0f} km from the GPS place in the file"
     if sigmas < CLAIMED_SIGMAS:
-        return (Remark(f"{told}, within the claim"),)
+        return f"{told}, within the claim"
     within_km = CLAIMED_SIGMAS * float(np.sqrt(np.diag(place.covariance)[:2].max())) / 1000
     if ahead_h := _hours_ahead(replace(mark, km=within_km), place):
         side = "ahead of" if ahead_h > 0 else "behind"
         why = f"as of a clock {abs(ahead_h):g} h {side} the zone in the file: state its own with --exif-utc-offset"
     else:
         why = "the telephone moved while it exposed, or its GPS place is an older one"
-    return (Remark(f"{told}, {sigmas:.1f} sigma, beyond the claim: {why}"),)
+    return f"{told}, {sigmas:.1f} sigma, beyond the claim: {why}"
 
 
-def of_copies(fixes: Sequence[Fix]) -> tuple[Remark, ...]:
+def of_copies(fixes: Sequence[Fix]) -> str:
     """Say that some photographs are of the same moment as others."""
     copies = len(fixes) - len({f.utc_unix_s for f in fixes})
-    return (Remark(f"{copies} of the photographs are copies of others, and count once"),) if copies else ()
+    return f"{copies} of the photographs are copies of others: they count once" if copies else ""
 
 
-def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[Remark, ...]:
+def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> str:
     """Say what --self-calibrate would give for a telephone that was turned on a table."""
     ups = np.array([f.tilt.up for f in fixes])
     middle = ups.mean(0) / np.linalg.norm(ups.mean(0))
@@ -98,46 +90,42 @@ def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[R
     gap = np.diff(turns, append=turns[0] + 2 * np.pi).max()
     known = given.calibration.frames > 0 or not given.has_level_inside
     if known or (ups @ middle).min() < TABLE_COSINE or gap > TABLE_GAP_RAD:
-        return ()
+        return ""
     left = total_covariance(t for t in whole.terms if t.origin is not Origin.A3)
     km, now_km = (float(np.sqrt(np.diag(c)[:2].max())) / 1000 for c in (left, whole.covariance))
-    sentence = (
+    return (
         "the camera was turned where it lay: --self-calibrate finds the error of its level, for a place to about "
         f"{km:.1f} km ({now_km:.1f} km without it), and with --save OUT later photographs have it"
     )
-    return (Remark(sentence),)
 
 
-def of_extrapolation(solved: Iterable[Solution]) -> tuple[Remark, ...]:
+def of_extrapolation(solved: Iterable[Solution]) -> str:
     """Say by how many days the last fix lies beyond the IERS table, and how far it may be off for that."""
     worst = max(solved, key=lambda s: s.extrapolated_days, default=None)
     if worst is None or worst.fix is None or worst.extrapolated_days <= 0:
-        return ()
+        return ""
     (ut1,) = (t for t in worst.fix.terms if t.name == "ut1")
-    sentence = (
+    return (
         f"the Earth's rotation is extrapolated {worst.extrapolated_days:.0f} days beyond the IERS table, "
         f"{np.sqrt(ut1.covariance[0, 0]):.0f} m east (1 sigma, in the budget): upgrade astropy-iers-data"
     )
-    return (Remark(sentence),)
 
 
-def of_average(whole: Average, solved: Sequence[Solution] = ()) -> Iterator[Remark]:
+def of_average(whole: Average, solved: Sequence[Solution] = ()) -> Iterator[str]:
     """Say what an average leaves out; solved: the frames with its fixes, of which a single one left out is named."""
     there = whole.latitude, whole.longitude
     if whole.moved:
         begin = utc_text(whole.began_unix_s)
-        yield Remark(
-            f"the instrument was moved: the average is of its last place, {whole.frames} frames since {begin}"
-        )
+        yield f"the instrument was moved: the average is of its last place, {whole.frames} frames since {begin}"
     off = [(apart_m((f.latitude, f.longitude), there), s.source) for s in solved if (f := s.fix)]
     if whole.left_out == 1 and off and max(off)[1]:
         away_m, source = max(off)
-        yield Remark(
+        yield (
             f"{source}: its place lies {length_text(away_m)} from the place of the others, further than its errors "
             "allow: it is not in the average: check its tilt and time"
         )
     elif whole.left_out:
-        yield Remark(
+        yield (
             f"{whole.left_out} fixes lie further from the others than their errors allow: they are not in the average"
         )
 
@@ -150,51 +138,41 @@ def beyond_stated(place: Average | None) -> bool:
     return place.left_out > 0 or sum(shares) > np.trace(place.covariance[:2, :2]) / 2
 
 
-def of_left_out(elevations: int) -> Iterator[Remark]:
+def of_left_out(elevations: int) -> str:
     """Say that some elevations are not used."""
-    if elevations:
-        yield Remark(
-            f"{elevations} elevations contradict the others and are left out: their tilts or pointings are wrong"
-        )
+    told = (
+        f"{elevations} elevations contradict the others and are left out: their tilts or pointings are wrong"
+    )
+    return told if elevations else ""
 
 
-def of_elevations(place: Average) -> Iterator[Remark]:
+def of_elevations(place: Average) -> tuple[str, ...]:
     """Say which elevations the place is not from, and that the others scatter."""
-    yield from of_left_out(place.left_out)
-    if beyond_stated(replace(place, left_out=0)):
-        yield Remark(
-            "the elevations scatter by more than the stated errors of tilts and A3: the claimed error includes it"
-        )
+    told = (
+        "the elevations scatter by more than the stated errors of tilts and A3: the claimed error includes it"
+    )
+    return of_left_out(place.left_out), told if beyond_stated(replace(place, left_out=0)) else ""
 
 
-def of_denied_a3(axis: FoundAxis, given: Calibration) -> Remark:
+def of_denied_a3(axis: FoundAxis, given: Calibration) -> str:
     """Say that the elevations deny the A3 that was given."""
-    return Remark(
+    return (
         f"the elevations deny the A3 given, by {axis.sigma_from(given):.0f} sigma: the place is from the A3 that they "
         "determine: calibrate again"
     )
 
 
-def of_a3(
-    calibration: Calibration, place: Fix | Average, ways: str = checks.BY_OPTIONS
-) -> tuple[Remark, ...]:
-    """Say that A3's error makes the position error large; ways: what to do then."""
-    sentence = checks.unknown_a3(calibration, place.covariance, place.terms, ways)
-    return (Remark(sentence),) if sentence else ()
-
-
-def of_turn(turned: Calibrated) -> Iterator[Remark]:
+def of_turn(turned: Calibrated) -> Iterator[str]:
     """Say how well A3 was found by turning."""
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
     if turned.plumb_stddev_arcsec > WORTH_SAVING_ARCSEC:
-        yield Remark(f"not calibrated: the headings hardly determine A3, {error}: turn it further")
+        yield (f"not calibrated: the headings hardly determine A3, {error}: turn it further")
         return
     found = turned.instrument.calibration
-    yield Remark(f"calibrated: {error}; {checks.at_another_lean(found)}")
+    yield (f"calibrated: {error}; {checks.at_another_lean(found)}")
     if checks.may_turn(found):
-        yield Remark(f"to use A3 at another lean, {checks.FIND_TURN}")
-    if turned.beyond:
-        yield Remark(turned.beyond)
+        yield (f"to use A3 at another lean, {checks.FIND_TURN}")
+    yield turned.beyond
 
 
 NEAR_KM = 50.0
@@ -245,16 +223,13 @@ class Near:
 
 def doubts(
     fixes: Sequence[Fix], whole: Fix | Average, mounting: Mounting | None, near: Near | None
-) -> Iterator[Remark]:
+) -> tuple[str, ...]:
     """Report places that mistaken tilts set apart, and a place far from `near`.
 
     mounting: of the fixes' frames, None if A3 was not given: then it is not checked.
     """
     frames: list[Leaning] = [(f.camera.rotation, f.tilt) for f in fixes]
-    if apart := _mistaken(mounting, frames):
-        yield Remark(apart)
-    if near is not None and (away := _far(near, whole, mounting, frames[-1:])):
-        yield Remark(away)
+    return _mistaken(mounting, frames), "" if near is None else _far(near, whole, mounting, frames[-1:])
 
 
 def apart_m(a: tuple[float, float], b: tuple[float, float]) -> float:

@@ -23,14 +23,15 @@ from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS
 from starpos.night.night import Night, Shot, Truth, why_none
-from starpos.night.remarks import Remark
 from starpos.night.together import FrameAnswer, Gathered, TurnedNight, together, turned
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
 from starpos.rotation import half_turns
 
 if TYPE_CHECKING:
-    from starpos.night.beside_gnss import Receiver, WatchedNight
+    from starpos.gnss.receiver import GnssTrack
+    from starpos.gnss.states import Learned
+    from starpos.night.beside_gnss import WatchedNight
 
 # if readings are further from their median than this, the camera was moved
 STILL_SIGMA = 8.0
@@ -54,7 +55,7 @@ class Exposures:
     work: Solving
     vertical: Vertical
     truth: Truth | None = None
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -62,16 +63,17 @@ class How:
     """How a night is solved.
 
     turn_stddev_deg: to find A3 by turning, the sigma of its turn about the plumb line; None to use A3 as given.
-    receiver: GNSS, which teaches the instrument; None without one.
+    gnss: places of a receiver, which teach the instrument; learned: what they taught on earlier nights.
     """
 
     turn_stddev_deg: float | None = None
-    receiver: "Receiver | None" = None
+    gnss: "GnssTrack | None" = None
+    learned: "Learned | None" = None
 
     @property
     def one_by_one(self) -> bool:
         """Whether each frame is solved by itself."""
-        return self.turn_stddev_deg is None and self.receiver is None
+        return self.turn_stddev_deg is None and self.gnss is None
 
     def work(self, asked: Solving) -> Solving:
         """The work on one frame: all that is asked, or only to identify it, where all are solved together."""
@@ -113,10 +115,10 @@ def answers_of(
         return NightAnswers(_in_order(rows, ()))
     solver = replace(asked.solver(seen[0].stars), progress=progress)
     solver, alike = of_one_camera(solver, seen)
-    if how.receiver is not None:
+    if how.gnss is not None:
         from starpos.night.beside_gnss import watched_night
 
-        watched = watched_night(solver, alike, asked.tilts, how.receiver, vertical)
+        watched = watched_night(solver, alike, asked.tilts, how.gnss, how.learned, vertical)
         answers = [
             FrameAnswer("", a.solution, s.stars, a) for a, s in zip(watched.answers, alike, strict=True)
         ]
@@ -196,15 +198,14 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
     for done, answer in enumerate(answers.each, 1):
         gathered.gather(answer)
         shots.append(Shot.of(answer.name, answer.solution, answer.stars))
-        if answer.solution.remark:
-            of_frames.append(Remark(answer.solution.remark))
+        of_frames.append(answer.solution.remark)
         progress(exposures.name[:20], done / exposures.count)
     whole = together(gathered, answers.given)
     said = [
         remark for part in (answers.turned, answers.watched) if part is not None for remark in part.remarks
     ]
     if gathered.lost is not None and not gathered.solved:
-        of_frames += work.fitting(gathered.lost)
+        of_frames.append(work.fitting(gathered.lost))
     night = Night(
         name=exposures.name,
         origin=exposures.origin,
@@ -215,7 +216,7 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
         atmosphere=exposures.work.atmosphere,
         truth=exposures.truth,
         watched=answers.watched,
-        remarks=(*exposures.remarks, *said, *of_frames, *whole.remarks),
+        remarks=(*exposures.remarks, *said, *filter(None, of_frames), *whole.remarks),
     )
     if night.combined is None or answers.instrument is None:
         return night

@@ -14,6 +14,7 @@ from starpos.averaging.elevation_axis import MIN_WITHOUT_SITE, FoundAxis, find_a
 from starpos.calibration.misalignment import Calibrated, turn
 from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, StarposError
+from starpos.fix.checks import unknown_a3, unnamed_inclinometer
 from starpos.fix.circle import Circle, circle_of
 from starpos.fix.fix import IDEAL, Fix
 from starpos.fix.searching import Sight
@@ -24,7 +25,7 @@ from starpos.frames.tables import Pointing
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
-from starpos.night.remarks import Near, Remark, doubts, of_inclinometer
+from starpos.night.remarks import Near, doubts
 
 if TYPE_CHECKING:
     from starpos.gnss.solving import Watched
@@ -101,7 +102,7 @@ class Together:
 
     average: Average | None = None
     why_not: str = ""
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[str, ...] = ()
 
 
 def together(gathered: Gathered, given: Instrument | None, near: Near | None = None) -> Together:
@@ -119,19 +120,17 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
     except FixError as error:
         why_not = str(error)
     place = fixes[-1] if whole is None else whole
-    said = list(remarks.of_extrapolation(gathered.solved))
+    said = [remarks.of_extrapolation(gathered.solved)]
     said += [] if whole is None else remarks.of_average(whole, gathered.solved)
     mounting = None
     if given is not None:
-        said += remarks.of_inclinometer(given)
-        said += remarks.of_a3(given.calibration, place)
+        said += [unnamed_inclinometer(given), unknown_a3(given.calibration, place.covariance, place.terms)]
         if given.vertical is None and not given.calibration.unknown:
             mounting = given.mounting
-        said += [] if whole is None else remarks.of_table(fixes, whole, given)
-        said += remarks.of_copies(fixes) if given.has_level_inside else ()
-    said += remarks.of_marks(place, gathered.marks_deg)
-    said += doubts(fixes, place, mounting, near)
-    return Together(whole, why_not, tuple(said))
+        said += [] if whole is None else [remarks.of_table(fixes, whole, given)]
+        said += [remarks.of_copies(fixes)] if given.has_level_inside else []
+    said += [remarks.of_marks(place, gathered.marks_deg), *doubts(fixes, place, mounting, near)]
+    return Together(whole, why_not, tuple(filter(None, said)))
 
 
 def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
@@ -145,7 +144,8 @@ def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
         place, _ = place_of_discs(circles, None if near is None else (near.latitude, near.longitude))
     except FixError as error:
         return Together(None, str(error))
-    return Together(place, "", (*remarks.of_average(place), *doubts((), place, None, near)))
+    said = *remarks.of_average(place), *doubts((), place, None, near)
+    return Together(place, "", tuple(filter(None, said)))
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class TurnedNight:
 
     solutions: tuple[Solution, ...]
     calibrated: Calibrated | None = None
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def worth_saving(self) -> bool:
@@ -185,10 +185,10 @@ def turned(
         found = turn(solver, items, tilts, turn_stddev_deg, solver.progress, known)
     except FixError as error:
         return TurnedNight(all_of(Solution.failed(item, Status.POOR_FIT, str(error)) for item in items))
-    said = tuple(remarks.of_turn(found))
+    said = list(remarks.of_turn(found))
     if any(s.fix is not None for s in found.solutions):
-        said += remarks.of_inclinometer(solver.instrument)
-    return TurnedNight(all_of(found.solutions), found, said)
+        said.append(unnamed_inclinometer(solver.instrument))
+    return TurnedNight(all_of(found.solutions), found, tuple(filter(None, said)))
 
 
 @dataclass(frozen=True)
@@ -233,10 +233,10 @@ def from_elevations(
             place = replace(place, left_out=place.left_out + axis.left_out)
         said = (
             *remarks.of_elevations(place),
-            *of_inclinometer(solver.instrument),
+            unnamed_inclinometer(solver.instrument),
             *doubts((), place, None, near),
         )
-        together = Together(place, "", said)
+        together = Together(place, "", tuple(filter(None, said)))
     except FixError as error:
         together = Together(None, str(error))
     found = Elevations(tuple(circles), together, axis)

@@ -2,23 +2,27 @@
 """A voyage from its frames and an IMU: frames are read and identified, then placed under way."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError, VoyageError
 from starpos.fix.solver import Solver
+from starpos.frames.frame import Frame, Stars
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import AxisDoubt, Instrument, framed
 from starpos.navigation.records import ImuModel, read_imu, read_imu_model, read_velocity
 from starpos.navigation.sightings import PlacelessFrame, sighting_of
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, adjust_voyage
-from starpos.night.reading import First, Instruments, Reader
+from starpos.night.reading import Instruments, Reader
 from starpos.night.work import Solving
+from starpos.parallel.processes import Here
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
 
@@ -36,80 +40,68 @@ class VoyageFrame:
     message: str = ""
 
 
-@dataclass(frozen=True)
-class IdentifyingVoyage:
-    """Work on the file of a frame, for any process: a VoyageFrame."""
-
-    read: Reader
-    given: Instruments
-
-    def __call__(self, path: str) -> VoyageFrame:
-        item = self.read(path)
-        sight = Solving(self.given)(item)
-        instrument = sight.instrument or self.given.of(item)
-        assert instrument is not None
-        eye, time_s = Solver(instrument, catalogue.load_catalogue()), item.mid_unix_s
-        try:
-            return VoyageFrame(time_s, sighting_of(sight.stars, eye, sight.solution), sight.solution.remark)
-        except (FrameError, FixError, TimeError) as error:
-            return VoyageFrame(time_s, None, str(error))
+def voyage_frame(given: Instruments, item: Frame | Stars) -> VoyageFrame:
+    """A frame, identified by every way there is."""
+    sight = Solving(given)(item)
+    instrument = sight.instrument or given.of(item)
+    assert instrument is not None
+    eye, time_s = Solver(instrument, catalogue.load_catalogue()), item.mid_unix_s
+    try:
+        return VoyageFrame(time_s, sighting_of(sight.stars, eye, sight.solution), sight.solution.remark)
+    except (FrameError, FixError, TimeError) as error:
+        return VoyageFrame(time_s, None, str(error))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Records:
-    """What a vehicle recorded besides frames: files, and the law by which its speed changes.
+def vessel_of(
+    instrument: Instrument,
+    atmosphere: Atmosphere,
+    axis: AxisDoubt | None = None,
+    *,
+    mount_stddev_deg: float = MOUNT_STDDEV_DEG,
+    height_m: float | None = None,
+    imu_model: str | Path | None = None,
+    vehicle: str | None = None,
+    drift_stddev: float = 0.0,
+) -> tuple[Vessel, str]:
+    """The vessel, and a remark if the mount's error includes an unknown axis; InstrumentError if it is too large.
 
-    imu: CSV of angular rates and accelerations.  imu_model: kalibr's YAML; None: a cheap one.
-    velocity: CSV of velocities over ground, along the body's axes; None without one.
-    vehicle: a key of `vessel.LAWS`, or 'parked'; None: anything that moves.
-    mount_stddev_deg: error of the camera's stated orientation on the vehicle.
-    drift_stddev: of current or wind, m/s, where velocities are through water or air.
-    height_m: of the vehicle; None: not known.
+    mount_stddev_deg: error of the camera's stated orientation on the vehicle.  height_m: of it; None: not known.
+    imu_model: kalibr's YAML; None: a cheap one.  vehicle, drift_stddev: as of `Vessel`.
     """
+    stddev, remark = math.radians(mount_stddev_deg), ""
+    if axis is not None:
+        remark, stddev = axis.counted_as("the mount"), math.hypot(stddev, axis.error_rad)
+        if math.degrees(stddev) > MAX_MOUNT_DEG:
+            raise InstrumentError(f"{remark}; with a mount known no better, there is no position under way")
+    vessel = Vessel(
+        model=ImuModel() if imu_model is None else read_imu_model(Path(imu_model)),
+        camera_to_body=np.asarray(instrument.link_to_camera, float).T,
+        mount_stddev=stddev,
+        atmosphere=atmosphere,
+        clock_stddev_s=instrument.clock_stddev_s,
+        vehicle=vehicle,
+        drift_stddev=drift_stddev,
+    )
+    if height_m is not None:
+        vessel = replace(vessel, height_m=height_m, height_stddev_m=GIVEN_HEIGHT_STDDEV_M)
+    return vessel, remark
 
-    imu: str | Path
-    imu_model: str | Path | None = None
-    velocity: str | Path | None = None
-    vehicle: str | None = None
-    mount_stddev_deg: float = MOUNT_STDDEV_DEG
-    drift_stddev: float = 0.0
-    height_m: float | None = None
 
-    def vessel(
-        self, instrument: Instrument, atmosphere: Atmosphere, axis: AxisDoubt | None = None
-    ) -> tuple[Vessel, str]:
-        """The vessel, and a remark if the mount's error includes an unknown axis; InstrumentError if it is too large."""
-        stddev, remark = math.radians(self.mount_stddev_deg), ""
-        if axis is not None:
-            remark, stddev = axis.counted_as("the mount"), math.hypot(stddev, axis.error_rad)
-            if math.degrees(stddev) > MAX_MOUNT_DEG:
-                raise InstrumentError(
-                    f"{remark}; with a mount known no better, there is no position under way"
-                )
-        vessel = Vessel(
-            vehicle=self.vehicle,
-            model=ImuModel() if self.imu_model is None else read_imu_model(Path(self.imu_model)),
-            camera_to_body=np.asarray(instrument.link_to_camera, float).T,
-            mount_stddev=stddev,
-            atmosphere=atmosphere,
-            clock_stddev_s=instrument.clock_stddev_s,
-            drift_stddev=self.drift_stddev,
-        )
-        if self.height_m is not None:
-            vessel = replace(vessel, height_m=self.height_m, height_stddev_m=GIVEN_HEIGHT_STDDEV_M)
-        return vessel, remark
+def voyage_of(
+    frames: Sequence[VoyageFrame], imu: str, velocity: str | None, vessel: Vessel, progress: Progress = quiet
+) -> Voyage:
+    """The places of the frames, by tables of an IMU and of velocities along the body's axes, if there are any.
 
-    def voyage(self, frames: Sequence[VoyageFrame], vessel: Vessel, progress: Progress = quiet) -> Voyage:
-        """The places of the frames; VoyageError for broken records, FixError where the stars do not support one."""
-        imu = read_imu(str(self.imu))
-        velocity = None if self.velocity is None else read_velocity(str(self.velocity))
-        times = np.array([np.nan if f.utc_unix_s is None else f.utc_unix_s for f in frames])
-        sightings = [f.sighting for f in frames if f.sighting is not None]
-        return adjust_voyage(sightings, imu, velocity, vessel, times, progress)
+    VoyageError for broken records, FixError where the stars do not support a place.
+    """
+    measured = None if velocity is None else read_velocity(velocity)
+    times = np.array([np.nan if f.utc_unix_s is None else f.utc_unix_s for f in frames])
+    sightings = [f.sighting for f in frames if f.sighting is not None]
+    return adjust_voyage(sightings, read_imu(imu), measured, vessel, times, progress)
 
 
 def voyage_frames(answers: Iterable[VoyageFrame | FrameError]) -> list[VoyageFrame]:
-    """The answers of `IdentifyingVoyage`; a frame that cannot be read has only its sentence."""
+    """The answers of `voyage_frame`; a frame that cannot be read has only its sentence."""
     return [VoyageFrame(None, None, str(a)) if isinstance(a, FrameError) else a for a in answers]
 
 
@@ -119,8 +111,9 @@ def navigate(
     instrument: Instrument | str | Path,
     *,
     atmosphere: Atmosphere | None = None,
+    velocity: str | Path | None = None,
     progress: Progress = quiet,
-    **records: float | str | Path | None,
+    **assumed: Any,
 ) -> Voyage:
     """Place, heading and velocity of a moving vehicle at each of its frames.
 
@@ -130,9 +123,9 @@ def navigate(
     imu : path of the IMU's CSV: utc_unix_s, gx, gy, gz (rad/s), ax, ay, az (m/s2)
     instrument : an Instrument, or the path of its file (YAML); its camera is mounted as link_to_camera says
     atmosphere : of refraction; None: not measured
+    velocity : path of the CSV of measured velocities along the body's axes, m/s; None: none
     progress : is called with the share of the work that is done
-    **records : the other fields of `Records`: imu_model, velocity, vehicle, mount_stddev_deg, drift_stddev,
-        height_m
+    **assumed : what else is known, as `vessel_of` takes it: imu_model, vehicle, mount_stddev_deg, drift_stddev, height_m
 
     Returns
     -------
@@ -156,19 +149,12 @@ def navigate(
     """
     paths, read = tuple(map(str, frames)), Reader()
     known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
-    about = First(read)(paths)
+    about = read.first(paths)
     if about is None:
         raise VoyageError(f"none of the {len(paths)} frames can be read: give star lists or frames")
     whole, axis = framed(known, about)
-    kept = Records(imu=imu, **records)  # type: ignore[arg-type]
-    vessel, _ = kept.vessel(
-        whole, Atmosphere.measured(None, None) if atmosphere is None else atmosphere, axis
-    )
-    work: Callable[[str], VoyageFrame] = IdentifyingVoyage(read, Instruments(whole))
-    answers: list[VoyageFrame | FrameError] = []
-    for path in paths:
-        try:
-            answers.append(work(path))
-        except FrameError as error:
-            answers.append(error)
-    return kept.voyage(voyage_frames(answers), vessel, progress)
+    air = Atmosphere.measured(None, None) if atmosphere is None else atmosphere
+    vessel, _ = vessel_of(whole, air, axis, **assumed)
+    work = partial(read.on, partial(voyage_frame, Instruments(whole)))
+    placed = voyage_frames(Here().map((work, path) for path in paths))
+    return voyage_of(placed, str(imu), None if velocity is None else str(velocity), vessel, progress)

@@ -97,9 +97,10 @@ class Kept:
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """A frame's solution with an attitude at a known place; its camera's focal length in px, its stars, its sky_mag."""
+    """A frame's attitude at a known place, its camera's focal length in px, its identified stars, its sky_mag."""
 
-    solution: Solution
+    at_place: AttitudeAtPlace
+    stars: int
     focal_px: float
     light: Light
     sky_mag: float = np.nan
@@ -132,10 +133,10 @@ def night_poses(answers: Iterable[Answer], longitude: float) -> tuple[NightPose,
     longitude: of the place, rad; it says when a night begins.
     """
     late_s = np.degrees(longitude) / MEAN_HOUR_DEG * HOUR_S - DAY_S / 2
-    seen = sorted(answers, key=lambda a: _at(a).utc_unix_s)
+    seen = sorted(answers, key=lambda a: a.at_place.utc_unix_s)
     groups: list[tuple[str, list[Answer]]] = []
     for answer in seen:
-        evening = datetime.fromtimestamp(_at(answer).utc_unix_s + late_s, timezone.utc)
+        evening = datetime.fromtimestamp(answer.at_place.utc_unix_s + late_s, timezone.utc)
         day = evening.strftime("%Y-%m-%d")
         if groups and groups[-1][0] == day and _stands([*groups[-1][1], answer]):
             groups[-1][1].append(answer)
@@ -144,22 +145,17 @@ def night_poses(answers: Iterable[Answer], longitude: float) -> tuple[NightPose,
     return tuple(_pose(day, group) for day, group in groups)
 
 
-def _at(answer: Answer) -> AttitudeAtPlace:
-    assert answer.solution.at_place is not None
-    return answer.solution.at_place
-
-
 def _stands(answers: Sequence[Answer]) -> bool:
     """Whether a camera stood still between frames."""
     try:
-        mean_attitude([_at(a) for a in answers])
+        mean_attitude([a.at_place for a in answers])
     except FixError:
         return False
     return True
 
 
 def _pose(day: str, answers: Sequence[Answer]) -> NightPose:
-    mean = mean_attitude([_at(a) for a in answers])
+    mean = mean_attitude([a.at_place for a in answers])
     lights = [a.light for a in answers]
     k, sigma = extinction(lights)
     limits = np.array([_limit(light, np.nan_to_num(k)) for light in lights])
@@ -169,12 +165,12 @@ def _pose(day: str, answers: Sequence[Answer]) -> NightPose:
         day=day,
         utc_unix_s=mean.utc_unix_s,
         frames=len(answers),
-        stars=sum(len(a.solution.names) for a in answers),
+        stars=sum(a.stars for a in answers),
         optics=mean.optics,
         focal_px=float(np.mean([a.focal_px for a in answers])),
         limit_mag=float(np.median(seen)) if len(seen) else np.nan,
         worst_limit_mag=float(limits[worst]),
-        worst_unix_s=_at(answers[worst]).utc_unix_s,
+        worst_unix_s=answers[worst].at_place.utc_unix_s,
         extinction=k,
         extinction_sigma=sigma,
         sky_mag=float(np.median(sky)) if len(sky) else np.nan,

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The work on one frame, as small objects that can be sent to any process or machine, where `OnFile` calls them."""
+"""The work on one frame, as small objects and functions that can be sent to any process, where `Reader.on` calls them."""
 
 import math
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
@@ -23,8 +22,7 @@ from starpos.identification.prior import Hint
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import ByGravity, Instrument, with_frame_size
 from starpos.instrument.tilt_log import Tilts
-from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
-from starpos.night.remarks import Remark
+from starpos.night.reading import Instruments, stars_of
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
 from starpos.sky.bodies import ERFA, SolarSystem
@@ -35,24 +33,6 @@ if TYPE_CHECKING:
 
 # Share by which a photograph's focal length may differ from its EXIF's, rounded to 1 mm of a 35 mm film's: 4 % of 13 mm.
 CUT_OUT = 0.06
-
-
-@dataclass(frozen=True)
-class OnFile:
-    """Does a work on the frame or list in a file."""
-
-    read: Reader
-    work: Callable[[Frame | Stars], Any]
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Files that it reads besides the frame."""
-        tilts = getattr(self.work, "tilts", None)
-        tilts = tilts.log if isinstance(tilts, ByGravity) else tilts
-        return (tilts.path,) if isinstance(tilts, TiltFile) else ()
-
-    def __call__(self, path: str) -> Any:
-        return self.work(self.read(path))
 
 
 def detected(item: Frame | Stars) -> tuple["Detection | Stars", float]:
@@ -214,16 +194,14 @@ class Solving:
             answer = placed(solver, sight.stars, answer, self.places)
         return replace(sight, solution=answer)
 
-    def fitting(self, lost: Stars) -> tuple[Remark, ...]:
-        """Say which focal length fits a frame that was not identified with the given one."""
+    def fitting(self, lost: Stars) -> str:
+        """Say which focal length fits a frame that was not identified with the given one; '' if none is known."""
         instrument = self.instruments.of(lost)
         # without its header's focal length a frame was searched already
         if instrument is None or self.instruments.by_header:
-            return ()
+            return ""
         focal_px = searching.focal_px_that_fits(self.solver(lost), lost)
-        if focal_px is None:
-            return ()
-        return (Remark(searching.other_focal_length(lost.place, focal_px)),)
+        return "" if focal_px is None else searching.other_focal_length(lost.place, focal_px)
 
 
 def identify(
@@ -266,23 +244,20 @@ def identify(
     return Solving(given, search_s=search_s, progress=progress)(item).solution
 
 
-@dataclass(frozen=True)
-class TrailSighted:
-    """Finds the trails of satellites on a frame; a frame's fault is a Solution that gives the reason."""
+def trails_seen(solving: Solving, item: Frame | Stars) -> "tuple[searching.Sight, FrameTrails] | Solution":
+    """A frame that is identified by every way there is, and its satellites' trails; FrameError for a list of stars.
 
-    solving: Solving
+    A frame's fault is a Solution that gives the reason.
+    """
+    from starpos.satellites.frames import trails_of
 
-    def __call__(self, item: Frame | Stars) -> "tuple[searching.Sight, FrameTrails] | Solution":
-        """A frame that is identified by every way there is, and its trails; FrameError for a list of stars."""
-        from starpos.satellites.frames import trails_of
-
-        if isinstance(item, Stars):
-            raise FrameError(f"{item.place}: a list of stars shows no trails: give the frame")
-        sight = self.solving(item)
-        known = sight.instrument or self.solving.instruments.of(item)
-        stars = sight.stars if known is None else replace(sight.stars, shutter=known.shutter or item.shutter)
-        try:
-            found = trails_of(item, stars, sight.solution, catalogue.load_catalogue())
-            return replace(sight, stars=stars, instrument=known), found
-        except StarposError as error:
-            return Solution.refused(stars, error)
+    if isinstance(item, Stars):
+        raise FrameError(f"{item.place}: a list of stars shows no trails: give the frame")
+    sight = solving(item)
+    known = sight.instrument or solving.instruments.of(item)
+    stars = sight.stars if known is None else replace(sight.stars, shutter=known.shutter or item.shutter)
+    try:
+        found = trails_of(item, stars, sight.solution, catalogue.load_catalogue())
+        return replace(sight, stars=stars, instrument=known), found
+    except StarposError as error:
+        return Solution.refused(stars, error)

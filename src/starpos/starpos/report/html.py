@@ -1,20 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all pages of a report are made of: the document, figures, angles; and its files, each written whole or not at
-all.
-"""
+"""What all pages of a report are made of: the document, figures, angles."""
 
 import base64
-import tempfile
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from html import escape
-from pathlib import Path
 
 import numpy as np
 
 from starpos import __version__
-from starpos.errors import WriteError
-from starpos.files import has_mark, write_whole
 from starpos.report.style import Picture
 
 STYLE = """
@@ -90,47 +83,3 @@ def wide_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     head = "".join(f"<th>{t}</th>" for t in titles)
     body = "\n".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in rows)
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead>\n{body}</table></div>'
-
-
-PAGE = "index.html"
-
-
-def check_folder(folder: Path, page: str = PAGE) -> None:
-    """Raise WriteError, before a night is worked on, where its report could not be written; leaves nothing behind."""
-    made: list[Path] = []
-    try:
-        made = [path for path in (folder, *folder.parents) if not path.exists()]
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-        _check_ours(folder / page)
-    except (OSError, ValueError) as error:
-        raise _refused(folder, error) from None
-    finally:
-        for path in made:
-            with suppress(OSError):
-                path.rmdir()
-
-
-def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write files by name; raises WriteError if one cannot be written, or would replace a file that is no report's."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in files:
-            _check_ours(folder / name)
-        for name, content in files.items():
-            write_whole(folder / name, content)
-    except (OSError, ValueError) as error:
-        raise _refused(folder, error) from None
-
-
-def _refused(folder: Path, error: Exception) -> WriteError:
-    """The error for a folder; a ValueError comes from a NUL in its name."""
-    reason = getattr(error, "strerror", None) or error
-    return WriteError(f"{folder}: the report cannot be written there ({reason}): give another --out")
-
-
-def _check_ours(path: Path) -> None:
-    if not path.exists() or (path.is_file() and has_mark(path)):
-        return
-    raise WriteError(f"{path}: it is there already and no report of starpos: move it, or give another --out")

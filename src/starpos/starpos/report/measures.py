@@ -51,34 +51,22 @@ def stability(night: Night) -> Stability:
     """Stability of the fixes of a night, each with its own tilt; at least one fix is needed."""
     places = night.places
     seen = np.array([[p.latitude, p.longitude, p.heading] for p in places])
-    away, heading_from = _from_mean(seen), "mean"
-    if np.abs(away[:, 2]).max() > max(
-        TURNED_RAD, TURNED_SIGMA * np.median([_own_sigma(p)[2] for p in places])
-    ):
+    sigma, away, heading_from = _own_sigmas(night), _from_mean(seen), "mean"
+    if np.abs(away[:, 2]).max() > max(TURNED_RAD, TURNED_SIGMA * np.median(sigma[:, 2])):
         true = _true_headings(night)
         heading_from = "truth" if true is not None else ""
         away[:, 2] = np.nan if true is None else half_turns(seen[:, 2] - true)
-    sigma = np.array([_own_sigma(p) for p in places])
-    return Stability(
-        np.array([k for k, _ in night.fixed]),
-        away / ARCSEC,
-        sigma / ARCSEC,
-        _outliers(away[:, :2], sigma[:, :2]),
-        heading_from,
-    )
+    return _stability(night, away, sigma, heading_from)
 
 
 def steadiness(night: Night, steady: np.ndarray) -> Stability:
     """Stability of the fixes with one tilt for all, `steady` (N, 3) of the night: the part of stars and air alone."""
-    away = _from_mean(steady)
-    without_tilt = np.array([_own_sigma(p, without="tilt") for p in night.places])
-    return Stability(
-        np.array([k for k, _ in night.fixed]),
-        away / ARCSEC,
-        without_tilt / ARCSEC,
-        _outliers(away[:, :2], without_tilt[:, :2]),
-        "mean",
-    )
+    return _stability(night, _from_mean(steady), _own_sigmas(night, without="tilt"), "mean")
+
+
+def _stability(night: Night, away: np.ndarray, sigma: np.ndarray, heading_from: str) -> Stability:
+    number, outlier = np.array([k for k, _ in night.fixed]), _outliers(away[:, :2], sigma[:, :2])
+    return Stability(number, away / ARCSEC, sigma / ARCSEC, outlier, heading_from)
 
 
 def around(night: Night, latitude: float, longitude: float) -> np.ndarray:
@@ -115,10 +103,13 @@ def _from_mean(seen: np.ndarray) -> np.ndarray:
     return away - away.mean(0)
 
 
-def _own_sigma(place: PlaceFix, without: str = "none") -> np.ndarray:
-    """Sigma (3,) of latitude, longitude, heading in rad by the errors that are new in each frame."""
-    own = [t.covariance[:3, :3] for t in place.terms if not t.common and not t.name.startswith(without)]
-    return _angles(sum(own, np.zeros((3, 3))), place.latitude)
+def _own_sigmas(night: Night, without: str = "none") -> np.ndarray:
+    """Sigma (N, 3) of latitude, longitude, heading in rad by the errors that are new in each frame."""
+    found = []
+    for p in night.places:
+        own = [t.covariance[:3, :3] for t in p.terms if not t.common and not t.name.startswith(without)]
+        found.append(_angles(sum(own, np.zeros((3, 3))), p.latitude))
+    return np.array(found)
 
 
 def _angles(covariance: np.ndarray, latitude: float) -> np.ndarray:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,8 @@ from starpos.fix.fix import PlaceFix, length_text
 from starpos.gnss.solving import Watched
 from starpos.gnss.watch import GnssStatus
 from starpos.night.night import Night, Truth
-from starpos.report import coast, measures, night_figures
+from starpos.parameters.table import rows_of
+from starpos.report import coast, measures, night_figures, style
 from starpos.report.html import document, figures, sexagesimal, table
 from starpos.report.style import Picture, figures_of
 from starpos.sky.catalogue import Catalogue
@@ -29,26 +31,33 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# name, title, caption and height (in) of a figure, and what draws it
-_Figure = tuple[str, str, str, float, "Callable[[Figure], None]"]
+TEXTS = Path(__file__).with_name("data") / "figures.yaml"
+# name of a figure in data/figures.yaml, what this one shows, and what draws it
+_Figure = tuple[str, object, "Callable[[Figure], None]"]
 
 
 def pictures_of(night: Night, catalogue: Catalogue) -> Iterator[Picture]:
     """All figures that a night has data for; without a fix only the health of its frames."""
-    for row in _figures(night, catalogue):
+    for figure in _figures(night, catalogue):
         # the time of a recorded solution may lie outside the tables of the Earth's rotation
         with suppress(TimeError):
-            yield Picture.drawn(*row, simulated=night.simulated)
+            yield _picture(*figure, night.simulated)
 
 
 def nights_picture(nights: Sequence[tuple[int, Night]]) -> Picture:
     """The errors of numbered nights whose truth is known, at least one."""
     simulated = all(night.simulated for _, night in nights)
+    return _picture("nights", "", lambda f: night_figures.draw_nights(f, nights), simulated)
 
-    def draw(figure: "Figure") -> None:
-        night_figures.draw_nights(figure, nights)
 
-    return Picture.drawn("nights", "Error of the nights", NIGHTS, 5.0, draw, simulated)
+def _picture(name: str, told: object, draw: "Callable[[Figure], None]", simulated: bool) -> Picture:
+    texts = rows_of(TEXTS)[name]
+    caption, figure = texts["caption"].format(told=told), style.new_figure(texts["height"])
+    draw(figure)
+    if simulated:
+        style.mark_simulated(figure)
+        caption = f"Simulated. {caption}"
+    return Picture(name, texts["title"], caption, style.png_of(figure))
 
 
 def _figures(night: Night, catalogue: Catalogue) -> Iterator[_Figure]:
@@ -58,97 +67,48 @@ def _figures(night: Night, catalogue: Catalogue) -> Iterator[_Figure]:
         if (over := draw.overlaid(night)) is not None:
             yield _residuals(*over)
         if draw.views(night):
-            title = "Where the camera looked"
-            yield "sky", title, _sky_caption(), 6.4, lambda f: draw.draw_sky(f, night, catalogue)
+            yield "sky", draw.OUTLINES, lambda f: draw.draw_sky(f, night, catalogue)
     if not night.shots:
         return
     if night.watched is not None and draw.compared_of(night.watched.answers):
         answers = night.watched.answers
-        title = "The drive beside GNSS"
-        yield "drive", title, _drive_caption(answers), 8.6, lambda f: draw.draw_drive(f, answers)
-    yield "health", "Frame by frame", HEALTH, 6.4, lambda f: draw.draw_health(f, night)
+        yield "drive", _alarm_told(answers), lambda f: draw.draw_drive(f, answers)
+    yield "health", "", lambda f: draw.draw_health(f, night)
 
 
 def _place_figures(night: Night) -> Iterator[_Figure]:
     draw = night_figures
     ground = (night.combined or night.places[0]).on_ground(night.vertical)
     where = ground.latitude, ground.longitude, ground.covariance[:2, :2]
-    yield "map", "Where on Earth", MAP, 6.6, lambda f: coast.draw_map(f, *where)
+    yield "map", "", lambda f: coast.draw_map(f, *where)
     if night.steady is not None:
         s = measures.steadiness(night, night.steady)
-        title = "Stability: one tilt for all frames"
-        yield "stability", title, _stability_caption(s, STEADY), 6.8, lambda f: draw.draw_stability(f, s)
+        yield "stability", _outliers_told(s), lambda f: draw.draw_stability(f, s)
     if len(night.fixed) > 1:
         each = measures.stability(night)
-        title = "Each frame with its own tilt"
-        yield "frames", title, _stability_caption(each, EACH), 6.8, lambda f: draw.draw_stability(f, each)
-    title = "Scatter of the fixes"
-    yield "scatter", title, _scatter_caption(night), 6.4, lambda f: draw.draw_scatter(f, night)
+        yield "frames", _outliers_told(each), lambda f: draw.draw_stability(f, each)
+    yield "scatter", _scatter_told(night), lambda f: draw.draw_scatter(f, night)
     if night.places[0].terms:
-        yield "budget", "Error budget", BUDGET, 5.6, lambda f: draw.draw_budget(f, night)
+        yield "budget", "", lambda f: draw.draw_budget(f, night)
 
 
-MAP = (
-    "The place in the middle, north on top, a line every 30 degrees; the lens shows 1100 km around it, a line every 5, "
-    "and the ellipse that holds the place with 95 %. "
-    "Coast lines: Natural Earth 1:110m, public domain; small islands are left out. Suspicious: another country."
-)
-STEADY = (
-    "The paper's stability test: the camera stood still, so all frames take the mean tilt of the night, and what is left "
-    "is what stars and air do. The bars are the errors claimed for the stars. Suspicious: a slope (the tripod settles, "
-    "or the clock drifts), a step (somebody touched it), points far beyond their bars (seeing, focus, distortion)."
-)
-EACH = (
-    "Every fix less the mean of all, with the readings of its own exposure; the bars are 1 sigma of what is new in each "
-    "frame, mostly the inclinometer's noise, which the paper's figures do not hold. Suspicious: more than a third of the "
-    "points beyond their bars, a slope, a step, a wave that follows the heading (an error of A3 turns with the mount)."
-)
-BUDGET = (
-    "1 sigma of every source of error, largest on top, on a logarithmic scale. What an average leaves as it is, is "
-    "common to all frames: only a better calibration, clock or barometer makes it smaller. Suspicious: a source that is "
-    "larger than the instrument's data sheet allows, such as centroids above a few metres."
-)
-RESIDUALS = (
-    "Where stars were seen less where the fit has them, all frames overlaid; where they are "
-    "many, the mean of each cell. Random arrows are noise; a pattern is the "
-    "camera's: arrows to or from the middle are radial distortion, all one way in one half a tilted sensor, a corner of "
-    "its own a decentred lens: calibrate the camera."
-)
-HEALTH = (
-    "What each frame had to work with. Crosses at the bottom are frames without a fix. Suspicious: stars that come and "
-    "go (clouds, dew), a residual that rises (focus, wind), a tilt that drifts or jumps (the mount), slow "
-    "identification."
-)
-DRIVE = (
-    "Above, the stars' own places, each with what was learned before it, and the GNSS places in the colour of what the "
-    "guard said. In the middle, how far they are apart; below, how well A3 and the deflection were known. Suspicious: a "
-    "distance that grows evenly (a drag)."
-)
-NIGHTS = (
-    "Combined fix of each night less its truth, astronomic, with the 1 sigma that is claimed. Suspicious: errors beyond "
-    "twice their bars in more than one night of twenty, or all on one side: the calibration has changed."
-)
-
-
-def _drive_caption(answers: Sequence[Watched]) -> str:
+def _alarm_told(answers: Sequence[Watched]) -> str:
     compared = night_figures.compared_of(answers)
     alarm = next((a for a in compared if a.compared and a.compared.status == GnssStatus.DISAGREES), None)
     if alarm is None or alarm.compared is None:
-        told = "No alarm: GNSS never disagreed."
-    else:
-        told = f"Alarm at {utc_text(alarm.solution.utc_unix_s or 0.0)}: {alarm.compared.sentence}."
-    return f"{DRIVE} {told}"
+        return "No alarm: GNSS never disagreed."
+    return f"Alarm at {utc_text(alarm.solution.utc_unix_s or 0.0)}: {alarm.compared.sentence}."
 
 
-def _stability_caption(s: measures.Stability, text: str) -> str:
+def _outliers_told(s: measures.Stability) -> str:
     found = int(s.outlier.sum())
     numbers = ", ".join(map(str, s.number[s.outlier][:8])) + (" ..." if found > 8 else "")
     which = f"{found} (frames {numbers})" if found else "none"
     far, own = measures.OUTLIER_SIGMA, measures.CLAIMED_SIGMA
-    return f"{text} Outliers, more than {far:g} robust sigma off and {own:g} of their own: {which}."
+    return f"Outliers, more than {far:g} robust sigma off and {own:g} of their own: {which}."
 
 
-def _scatter_caption(night: Night) -> str:
+def _scatter_told(night: Night) -> str:
     count = len(night.fixed)
     about = "the average" if night.combined else "their mean, for they do not average"
     text = f"Fixes about {about}. Shaded: the errors that are new in every frame"
@@ -164,30 +124,19 @@ def _scatter_caption(night: Night) -> str:
         d2 = np.array([east, north]) @ np.linalg.solve(night.combined.covariance[:2, :2], [east, north])
         verdict = "inside" if d2 <= measures.INSIDE_95 else "OUTSIDE"
         text += f" The truth is {figures_of(np.hypot(east, north))} m from it, {verdict} the 95 % ellipse."
-    return (
-        text + " Suspicious: two heaps (the mount slipped), a line (the clock drifts: it is east and west)."
-    )
+    return text
 
 
 def _residuals(xy: np.ndarray, residual_px: np.ndarray, size: tuple[int, int]) -> _Figure:
     rms = figures_of(np.sqrt(np.mean(residual_px**2)))
-    text = f"{len(xy)} stars, root mean square {rms} px an axis. {RESIDUALS}"
-    height = 0.9 + 6.4 * min(size[1] / size[0], 1.6)
 
     def draw(figure: "Figure") -> None:
+        figure.set_figheight(0.9 + 6.4 * min(size[1] / size[0], 1.6))
         # the key of the arrows lies outside the axes
         figure.set_layout_engine("constrained", rect=(0, 0.06, 1, 0.94))
         residual_map.draw_residuals(figure.subplots(), xy, residual_px, *size)
 
-    return "residuals", "Residuals over the frame", text, height, draw
-
-
-def _sky_caption() -> str:
-    return (
-        f"Seen as on a map, the zenith in the middle: at most {night_figures.OUTLINES} outlines with their identified "
-        "stars, and the centre of every frame; grey, the brightest stars of that part of the sky in the middle of the "
-        "night. Suspicious: frames far from the zenith (roll and refraction count more there), half a frame empty."
-    )
+    return "residuals", f"{len(xy)} stars, root mean square {rms} px an axis.", draw
 
 
 # maximum number of frames listed by name
@@ -212,10 +161,7 @@ def page(
             parts.append(f'<h2 id="night{number}">{number}. {escape(night.name)}</h2>')
         parts += [_place(night), _simulated(night), _summary(night), figures(pictures)]
     parts.append(
-        f"<footer><p>Made by starpos {escape(__version__)} on {escape(made_utc)}, on this machine: nothing left it, and "
-        "the page loads nothing. Positions are astronomic unless said otherwise; errors are 1 sigma. The paper is "
-        "Izadmehr &amp; Khakian Ghomi, &ldquo;Design and construction of a high resolution, portable and low-cost "
-        "positioner by a star tracking system&rdquo;.</p></footer>"
+        f"<footer><p>{rows_of(TEXTS)['footer'].format(version=escape(__version__), made=escape(made_utc))}</p></footer>"
     )
     return document(title, parts)
 

@@ -2,7 +2,7 @@
 """Look of the figures: their size and colours, and PNG files without any global state of matplotlib."""
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -37,24 +37,6 @@ class Picture:
     title: str
     caption: str
     png: bytes
-
-    @classmethod
-    def drawn(
-        cls,
-        name: str,
-        title: str,
-        caption: str,
-        height_in: float,
-        draw: "Callable[[Figure], None]",
-        simulated: bool = False,
-    ) -> "Picture":
-        """A new figure of the common width, on which `draw` draws; one of a simulated night says so."""
-        figure = new_figure(height_in)
-        draw(figure)
-        if simulated:
-            mark_simulated(figure)
-            caption = f"Simulated. {caption}"
-        return cls(name, title, caption, png_of(figure))
 
 
 def mark_simulated(figure: "Figure") -> None:

@@ -268,15 +268,6 @@ class NamedStars:
         """Names, and V magnitudes (M,)."""
         return self._look_up()
 
-    def of_rows(self, row: np.ndarray) -> "NamedStars":
-        """The stars in these rows (n,)."""
-
-        def look_up() -> tuple[tuple[str, ...], np.ndarray]:
-            names, magnitudes = self.labels
-            return tuple(names[k] for k in row), magnitudes[row]
-
-        return NamedStars(len(row), look_up)
-
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, NamedStars):
             return NotImplemented

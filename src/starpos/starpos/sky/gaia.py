@@ -40,14 +40,11 @@ UNITS = {
     "pmra_error": "mas / yr",
     "pmdec_error": "mas / yr",
     "parallax": "mas",
+    "parallax_error": "mas",
     "ref_epoch": "yr",
     "phot_g_mean_mag": "mag",
+    "ruwe": "",
 }
-# read where they are there: a star's errors are larger by its RUWE (Lindegren et al. 2021, A&A 649, A2), and the parallax
-# has an error of its own; else twice the place's, as for bright stars (0.02 to 0.03 mas and 0.01 to 0.02; Gaia
-# Collaboration 2021, A&A 649, A1)
-RUWE, PARALLAX_ERROR = "ruwe", "parallax_error"
-PARALLAX_TO_PLACE = 2.0
 MAX_BYTES = 4_000_000_000
 # A star of Tycho-2 is one of Gaia's within this number of sigma of its place, and this distance besides,
 MATCH_SIGMA, MATCH_MAS = 5.0, 200.0
@@ -99,22 +96,17 @@ def read(path: Path) -> Extract:
     if not known.any():
         raise CatalogueError(f"{path}: none of its {len(table)} stars has a place, a motion and a parallax")
     c = {name: values[known] for name, values in column.items()}
-    worse = np.ones(len(table)) if RUWE not in names else _column(path, table[names[RUWE]], RUWE, "")
-    worse = np.maximum(np.nan_to_num(worse[known], nan=1.0), 1.0)
-    place = np.hypot(c["ra_error"], c["dec_error"]) / np.sqrt(2)
-    parallax_error = PARALLAX_TO_PLACE * place
-    if PARALLAX_ERROR in names:
-        given = _column(path, table[names[PARALLAX_ERROR]], PARALLAX_ERROR, "mas")[known]
-        parallax_error = np.where(np.isfinite(given), given, parallax_error)
+    # Lindegren et al. 2021, A&A 649, A2
+    worse = np.maximum(c["ruwe"], 1.0)
     return Extract(
         ra_deg=c["ra"],
         dec_deg=c["dec"],
-        sigma_mas=worse * place,
+        sigma_mas=worse * np.hypot(c["ra_error"], c["dec_error"]) / np.sqrt(2),
         pm_ra=c["pmra"],
         pm_dec=c["pmdec"],
         sigma_pm=worse * np.hypot(c["pmra_error"], c["pmdec_error"]) / np.sqrt(2),
         parallax_mas=np.maximum(c["parallax"], 0.0),
-        sigma_parallax=worse * parallax_error,
+        sigma_parallax=worse * c["parallax_error"],
         epoch=c["ref_epoch"],
         gmag=c["phot_g_mean_mag"],
     )
@@ -171,7 +163,7 @@ def with_gaia(base: Catalogue, extract: Extract, year: float) -> tuple[Catalogue
     parallax = base.parallax_mas()
     sigma, sigma_pm = _errors(base)
     epoch = EPOCH_ZERO + base.epoch_code.astype(float)
-    gaia = _rows(extract, star)
+    gaia = replace(extract, **{name: column[star] for name, column in vars(extract).items()})
     there_ra, there_dec = gaia.at(year)
     pm_ra[row], pm_dec[row], parallax[row] = gaia.pm_ra, gaia.pm_dec, gaia.parallax_mas
     back = (EPOCH - year) * MAS_DEG
@@ -194,10 +186,6 @@ def _errors(base: Catalogue) -> tuple[np.ndarray, np.ndarray]:
     """
     step = CODE_STEP ** np.array([base.sigma_code, base.pm_sigma_code], float) * (1 - 1e-6)
     return SMALLEST_MAS * step[0], SMALLEST_MAS_YEAR * step[1]
-
-
-def _rows(extract: Extract, rows: np.ndarray) -> Extract:
-    return replace(extract, **{name: column[rows] for name, column in vars(extract).items()})
 
 
 def _matched(base: Catalogue, extract: Extract) -> tuple[np.ndarray, np.ndarray]:

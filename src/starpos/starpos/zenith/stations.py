@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy import special
 
 from starpos.earth.geoid import Geoid
 from starpos.earth.place import Place
@@ -161,6 +160,9 @@ class Station:
     @property
     def probability(self) -> float:
         """Probability that its sessions differ by as much, by chance; 1 of a single one."""
+        # the solver loads this module, and is to start without scipy
+        from scipy import special
+
         return float(special.chdtrc(self.degrees, self.chi2)) if self.degrees else 1.0
 
     @property

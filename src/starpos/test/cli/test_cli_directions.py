@@ -84,20 +84,6 @@ def test_a_grid_is_drawn(run, night, tmp_path):
     assert status == 2 and "horizon.csv" in err[-1]
 
 
-def test_a_small_frame_is_enlarged(run, night, tmp_path, monkeypatch):
-    frame, picture = sorted(night.glob("frame_*.fits"))[0], tmp_path / "grid.png"
-    sizes = []
-    for most in (1, 3000):
-        monkeypatch.setattr(altaz, "SMALLEST_PX", most)
-        run("altaz", frame, "100", "200", *WIDE, *AIR, *SITE, "--overlay", picture)
-        drawn = cv2.imread(str(picture)).astype(int)
-        sizes.append(drawn.shape[1])
-        n = drawn.shape[1] / 1000
-        x, y = round(100.5 * n - 0.5), round(200.5 * n - 0.5)
-        assert (np.abs(drawn[y - 8 : y + 9, x - 8 : x + 9] - (60, 60, 255)).max(2) < 30).sum() >= 20
-    assert sizes == [1000, 1500]
-
-
 def test_the_axis_of_a_mount(run, lists):
     frames = sorted(lists.glob("stars_*.csv"))
     # the simulated instrument turns about the vertical

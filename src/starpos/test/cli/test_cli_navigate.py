@@ -10,7 +10,7 @@ from cli_calls import AIR, WIDE, objects
 
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.instrument import AxisDoubt, Instrument
-from starpos.night.under_way import Records
+from starpos.night.under_way import vessel_of
 from starpos_testing.command_line import run
 from starpos_testing.skies.folders import write_drive
 from starpos_testing.voyages import INDUSTRIAL, made
@@ -134,9 +134,7 @@ def test_crops_of_a_sensor_of_which_nobody_says_the_size_are_refused_as_of_a_mou
 
 def test_an_axis_that_nobody_knows_widens_the_mount():
     doubt = AxisDoubt("cut out", 300.0, np.radians(4))
-    vessel, remark = Records(imu="imu.csv", mount_stddev_deg=3.0).vessel(
-        Instrument(1000.0), Atmosphere(), doubt
-    )
+    vessel, remark = vessel_of(Instrument(1000.0), Atmosphere(), doubt, mount_stddev_deg=3.0)
     assert vessel.mount_stddev == pytest.approx(np.radians(5))
     assert "4 deg that count as an error of the mount" in remark
 

@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from starpos.cli import places_file
+from starpos.cli import overwriting, places_file
 from starpos.errors import InstrumentError, WriteError
 
 GPX = "{http://www.topografix.com/GPX/1/1}"
@@ -53,9 +53,9 @@ def test_only_files_of_starpos_are_replaced(tmp_path):
     path = tmp_path / "a.gpx"
     path.write_text("mine")
     with pytest.raises(InstrumentError, match="not of starpos"):
-        places_file.check_ours(path)
+        overwriting.ours(path)
     for name in ("b.gpx", "b.geojson"):
         places_file.write(f"{tmp_path / name}", [ANSWER])
-        places_file.check_ours(tmp_path / name)
+        overwriting.ours(tmp_path / name)
     with pytest.raises(WriteError, match="cannot be written"):
         places_file.write(f"{path}/b.gpx", [ANSWER])

@@ -130,5 +130,5 @@ def test_a_bag_of_ros_1_is_told_how_to_convert(run, tmp_path, command):
 def test_a_bag_that_gives_no_night_is_said_and_not_a_traceback(capsys):
     args = argparse.Namespace(json=True, csv=False)
     error = FrameError("a: ValueError: no such type")
-    assert replay.tell(args, Output(args, (), ""), "a", error, None) == 2
+    assert replay.tell(args, Output(args, "fix"), "a", error, None) == 2
     assert "no such type" in capsys.readouterr().err

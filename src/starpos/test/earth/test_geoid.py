@@ -227,11 +227,6 @@ TIFFS = {
     "tiles, deflated, predictor 3": {"tile": 32},
     "pixel is area": {"point": False, "tie": (9.9, 48.95)},
     "64 bits": {"kind": "f8"},
-    "scale and offset": {
-        "heights": HEIGHTS[::-1] * 10 - 30,
-        "extra": [(42112, "s", b'<GDALMetadata>\n  <Item name="OFFSET" sample="0" role="offset">3</Item>\n'
-                   b'<Item name="SCALE" sample="0" role="scale">0.1</Item></GDALMetadata>\0')],
-    },
     "its type": {
         "extra": [(42112, "s", b'<GDALMetadata><Item name="TYPE">VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL</Item>'
                    b"</GDALMetadata>\0")],
@@ -330,8 +325,8 @@ BROKEN_TIFF = {
         {"extra": [(42112, "s", b'<Item name="DESCRIPTION" sample="0">hydroid_height</Item>\0')]},
         "hydroid_height",
     ),
-    "a scale of nothing": ({"extra": [(42112, "s", b'<Item name="SCALE">0</Item>\0')]}, "scale"),
-    "a scale of letters": ({"extra": [(42112, "s", b'<Item name="SCALE">one</Item>\0')]}, "number"),
+    "a scale": ({"extra": [(42112, "s", b'<Item name="SCALE">0.1</Item>\0')]}, "-unscale"),
+    "an offset": ({"extra": [(42112, "s", b'<Item name="OFFSET">3</Item>\0')]}, "OFFSET"),
     "no data of letters": ({"extra": [(42113, "s", b"nothing\0")]}, "no data"),
     "a tag without an end": ({"extra": [(42113, "s", b"7" * (2 << 20))]}, "tag 42113"),
     "two widths": ({"extra": [(256, "I", (25,))]}, "decoded"),

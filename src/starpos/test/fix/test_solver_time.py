@@ -90,8 +90,8 @@ def test_a_fix_beyond_the_tables_says_by_how_much(night, catalogue, rng):
     s = solver.solve(stars_of(scene, catalogue, rng, later), tilt_of(scene, rng, later))
     assert s.ok, s.message
     assert s.extrapolated_days == earth_state(later + EXPOSURE / 2).orientation.extrapolated_days > 0
-    assert of_extrapolation([within]) == of_extrapolation([]) == ()
-    (remark,) = of_extrapolation([s, within, s])
+    assert of_extrapolation([within]) == of_extrapolation([]) == ""
+    remark = of_extrapolation([s, within, s])
     east = 465.1 * np.cos(s.fix.latitude) * earth_state(later).orientation.ut1_sigma_s
     assert remark.startswith(f"the Earth's rotation is extrapolated {s.extrapolated_days:.0f} days")
     assert f"{east:.0f} m east" in remark

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import contextlib
+import io
 import os
 import struct
 import sys
@@ -15,7 +16,7 @@ from astropy.time import Time, TimeDelta
 from astropy.utils import iers
 
 from starpos.errors import LETTERS, FrameError, one_line
-from starpos.frames.fits import decode_fits
+from starpos.frames.fits import read_fits
 from starpos.frames.frame import Frame
 from starpos.frames.header import read_times
 from starpos.frames.reading import read_frame, why_no_time
@@ -371,13 +372,13 @@ def test_a_file_that_may_not_be_opened(tmp_path):
 
 def test_the_bytes_of_a_fits_file_are_read_like_the_file_and_short_ones_refused(tmp_path):
     data = write_fits(tmp_path / "a.fits", np.tile(PIXELS, (50, 50)), **NIGHT).read_bytes()
-    frame, header = decode_fits(data, "the camera's frame")
+    frame, header = read_fits(io.BytesIO(data), "the camera's frame")
     assert header == NIGHT
     assert np.array_equal(frame.pixels, read_frame(tmp_path / "a.fits").pixels)
     assert (frame.mid_unix_s, frame.source) == (unix(2026, 11, 2, 18) + 0.375, "the camera's frame")
     for length in (0, 100, 2880, 2881, len(data) - 2880):
         with pytest.raises(FrameError, match=r"^the camera's frame: .*\.$"):
-            decode_fits(data[:length], "the camera's frame")
+            read_fits(io.BytesIO(data[:length]), "the camera's frame")
 
 
 def test_what_a_library_says_is_cut_between_words():

@@ -6,7 +6,8 @@ import pytest
 from starpos import rotation
 from starpos.errors import TiltError, TiltRangeError
 from starpos.instrument import sensors
-from starpos.instrument.inclinometer import InclinometerErrors, Tilt, level_of, levelling_of, up_of, up_slope
+from starpos.instrument.inclinometer import InclinometerErrors, Tilt, level_of, up_of, up_slope
+from starpos.instrument.mounting import LocalLevel
 
 DEG = np.pi / 180
 NO_ERROR = np.zeros((2, 2))
@@ -50,7 +51,9 @@ def test_levelling_turns_the_level_as_the_errors_of_the_angles_do(rng):
     for _ in range(50):
         theta = rng.uniform(-0.6, 0.6, 2)
         before, error = up_of(theta), rng.normal(0, 1e-6, 2)
-        turn = rotation.from_vector(levelling_of(level_of(before)) @ up_slope(theta, before) @ error)
+        a2 = level_of(before)
+        turns = LocalLevel(before, a2, a2, np.zeros((3, 0))).turns
+        turn = rotation.from_vector(turns @ up_slope(theta, before) @ error)
         up = level_of(before).T @ turn.T @ [0, 0, 1.0]
         np.testing.assert_allclose(up, up_of(theta + error), atol=1e-11)
 

@@ -44,14 +44,7 @@ def seen_with(camera, altitude_deg):
     )
     high = local[:, 2] > sin(radians(20))
     places = [true_of(*v) for v in local[high]]
-    return platepar.SkyPixels(
-        xy=xy[high],
-        icrs=np.array(places),
-        utc_unix_s=UTC,
-        latitude=LATITUDE,
-        longitude=LONGITUDE,
-        height_m=120.0,
-    )
+    return xy[high], np.array(places)
 
 
 JD = 2440587.5 + UTC / 86400
@@ -123,22 +116,21 @@ def pixel_of(plate, centre, place):
 
 @pytest.mark.parametrize(("camera", "altitude", "near"), [(FISHEYE, 80, 0.01), (NARROW, 45, 0.02)])
 def test_rms_sees_each_star_where_the_camera_does(camera, altitude, near, tmp_path):
-    seen = seen_with(camera, altitude)
-    plate, worst = platepar.platepar_of(camera, seen)
+    seen_xy, icrs = seen_with(camera, altitude)
+    plate, worst = platepar.platepar_of(camera, seen_xy, icrs, UTC, (LATITUDE, LONGITUDE, 120.0))
     plate = json.loads(json.dumps(plate))
     pointing = np.radians([plate[k] for k in ("RA_d", "dec_d", "pos_angle_ref")])
     # the one formula that is not simple in angles is compared with RMS's own values below
     centre = platepar._seen_pointing(pointing, JD, LATITUDE, LONGITUDE)
     off = [
-        np.hypot(*np.subtract(pixel_of(plate, centre, v), xy))
-        for v, xy in zip(seen.icrs, seen.xy, strict=True)
+        np.hypot(*np.subtract(pixel_of(plate, centre, v), xy)) for v, xy in zip(icrs, seen_xy, strict=True)
     ]
     assert max(off) < near and worst == pytest.approx(max(off), abs=1e-5)
     # back to a lens: the polynomial of RMS's other way
     path = tmp_path / "platepar_cmn2010.cal"
     path.write_text(json.dumps(plate))
     read = instrument_file.read(path).camera
-    assert np.abs(read.project(camera.directions(*seen.xy.T)) - seen.xy).max() < 0.05
+    assert np.abs(read.project(camera.directions(*seen_xy.T)) - seen_xy).max() < 0.05
 
 
 def test_a_pointing_is_turned_as_rms_turns_it():

@@ -60,10 +60,10 @@ def test_a_preset_is_of_its_class(name):
 
 def test_the_sheets_rules_in_figures():
     # ADIS16209: 0.19 mg/sqrt(Hz) through its sensor's 50 Hz are the 1.7 mg that it states too
-    assert sensors.rms(0.19, 50) == pytest.approx(1.7, rel=0.02)
-    assert sensors.limit(1.0) == pytest.approx(
-        np.random.default_rng(1).uniform(-1, 1, 100_000).std(), rel=0.01
-    )
+    adis = {"value": "0.19", "unit": "mg", "over": "", "rule": "density", "hz": "50"}
+    assert sensors._sigma(adis) == pytest.approx(1.7e-3, rel=0.02)
+    within = np.random.default_rng(1).uniform(-1, 1, 100_000).std()
+    assert sensors._sigma(adis | {"value": "1", "rule": "limit"}) == pytest.approx(within * 1e-3, rel=0.01)
     assert np.degrees(sensors.presets()["scl3300"].pose_rad) == pytest.approx(0.019, abs=5e-4)
 
 

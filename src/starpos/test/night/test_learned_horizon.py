@@ -13,8 +13,7 @@ def frames(rng, ground, number, hidden=0.05, margin=None):
     azimuth, altitude = rng.uniform(0, 360, number), np.degrees(np.arcsin(rng.uniform(0, 1, number)))
     seen = (altitude > ground(azimuth)) & (rng.uniform(0, 1, number) > hidden)
     margin = np.full(number, 20.0) if margin is None else margin
-    parts = (np.array_split(c, 5) for c in (azimuth, altitude, seen, margin))
-    return [horizon.Expected(*columns) for columns in zip(*parts, strict=True)]
+    return np.array_split(np.array([azimuth, altitude, seen, margin]), 5, axis=1)
 
 
 def trees(azimuth):

@@ -11,7 +11,7 @@ from starpos.frames.frame import Frame, no_stars
 from starpos.frames.tables import write_star_list
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
-from starpos.night.reading import About, First, Instruments, Reader, TiltFile
+from starpos.night.reading import Instruments, Reader, TiltFile
 from starpos_testing.skies.scenes import START, random_stars
 
 GIVEN = Instrument(5000.0)
@@ -53,19 +53,19 @@ def test_a_shutter_that_opens_late_moves_the_time_and_widens_it(stars_file):
 
 def test_the_first_frame_that_can_be_read_tells_of_all_and_is_read_once(stars_file, tmp_path, monkeypatch):
     read = Reader()
-    about = First(read)((str(tmp_path / "none.fits"), stars_file))
-    assert isinstance(about, About) and (about.width, about.height) == (1000, 700)
+    about = read.first((str(tmp_path / "none.fits"), stars_file))
+    assert (about.width, about.height, len(about)) == (1000, 700, 0)
     kept = read(stars_file)
     monkeypatch.setattr("starpos.night.reading.read_frame", lambda *_: Frame(np.zeros((2, 2), np.uint8)))
     # once kept, then read anew
     assert kept.width == 1000 and read(stars_file).width == 2
-    assert First(Reader())(()) is None
+    assert Reader().first(()) is None
 
 
 def test_a_frame_that_cannot_be_read_is_an_error_of_its_own(tmp_path):
     with pytest.raises(FrameError):
         Reader()(str(tmp_path / "none.fits"))
-    assert First(Reader())((str(tmp_path / "none.fits"),)) is None
+    assert Reader().first((str(tmp_path / "none.fits"),)) is None
 
 
 def test_a_table_of_tilts_is_read_again_only_if_it_has_changed(tmp_path):

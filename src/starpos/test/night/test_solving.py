@@ -18,7 +18,6 @@ from starpos.fix.solver import Solver
 from starpos.gnss.receiver import GnssTrack
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, TiltsByTime
-from starpos.night.beside_gnss import Receiver
 from starpos.night.reading import Instruments
 from starpos.night.solving import ONE_BY_ONE, Exposures, How, answers_of, solved_night
 from starpos.night.together import Gathered, together, turned
@@ -131,7 +130,7 @@ def test_points_are_no_stars_though_the_last_frame_was_near(still, points):
     assert [a.solution.status for a in answers] == [Status.OK, Status.NOT_IDENTIFIED]
 
 
-@pytest.mark.parametrize("how", [ONE_BY_ONE, How(180.0), How(receiver=Receiver(GnssTrack([])))])
+@pytest.mark.parametrize("how", [ONE_BY_ONE, How(180.0), How(gnss=GnssTrack([]))])
 def test_a_file_that_cannot_be_read_costs_its_own_answer_alone(how, still):
     items = [UNREADABLE, still.stars[0], UNREADABLE]
     answers = list(still.answers(how, items).each)
@@ -140,7 +139,7 @@ def test_a_file_that_cannot_be_read_costs_its_own_answer_alone(how, still):
     assert answers[0].solution.message == str(UNREADABLE) and answers[1].stars is still.stars[0]
 
 
-@pytest.mark.parametrize("how", [How(180.0), How(receiver=Receiver(GnssTrack([])))])
+@pytest.mark.parametrize("how", [How(180.0), How(gnss=GnssTrack([]))])
 def test_frames_solved_together_are_only_identified_before(how, still):
     work = how.work(still.work)
     assert (work.tilts, work.places) == (None, None) and ONE_BY_ONE.work(still.work) is still.work
@@ -173,7 +172,7 @@ def test_a_frame_that_no_way_identified_is_not_searched_again_while_turning(turn
 def test_beside_gnss_nothing_that_is_identified_or_lost_is_searched_again(still, points, monkeypatch):
     site = still.scene.site
     place = Place.on_ellipsoid(site.latitude_deg, site.longitude_deg, Deflection(0.0, 0.0, 0.0))
-    how = How(receiver=Receiver(_Standing(place)))
+    how = How(gnss=_Standing(place))
     sights = [*still.sights(how), *still.sights(how, [points])]
     monkeypatch.setattr("starpos.fix.solver.identify", None)
     answers = answers_of(sights, still.work, Deflection(), how)

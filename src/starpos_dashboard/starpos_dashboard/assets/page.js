@@ -5,10 +5,11 @@ const SVG = "http://www.w3.org/2000/svg";
 
 export const element = (id) => document.getElementById(id);
 
-export function say(id, text) {
-  const e = element(id);
+export function write(e, text) {
   if (e.textContent !== text) e.textContent = text;
 }
+
+export const say = (id, text) => write(element(id), text);
 
 export function add(parent, name, attributes = {}, text = "") {
   const e = document.createElementNS(parent.namespaceURI === SVG || name === "svg" ? SVG : parent.namespaceURI, name);
@@ -25,9 +26,8 @@ export function rows(parent, list, make, fill) {
   list.forEach((row, i) => fill(parent.children[i], row));
 }
 
-// A card whose data is old, or missing, looks so; the badge says how old.
-export function dress(card, badge, state, text) {
-  element(card).classList.toggle("old", state === "old");
-  element(card).classList.toggle("missing", state === "missing");
-  say(badge, text);
+// A card whose data is old, or missing, looks so; its badge says how old.
+export function dress(name, state, badge) {
+  for (const kind of ["old", "missing"]) element(`${name}-card`).classList.toggle(kind, state === kind);
+  say(`${name}-age`, badge);
 }
