@@ -10,7 +10,14 @@ from scipy import spatial
 from scipy.linalg import lapack
 
 from starpos.detection._learn import light_noise, marginal_equations
-from starpos.detection._moments import own_shapes, squared_widths, window_moments, without_window
+from starpos.detection._moments import (
+    clip_widths,
+    own_shapes,
+    relative_widths,
+    squared_widths,
+    window_moments,
+    without_window,
+)
 from starpos.detection._pixels import smooth_mosaic
 from starpos.detection._sky import median
 from starpos.detection.background import SkyPlane
@@ -24,8 +31,6 @@ from starpos.detection.stamps import (
     are_dots,
     centroid,
     cut,
-    frame_shape,
-    relative_widths,
     window_for,
 )
 
@@ -305,12 +310,9 @@ def _teachers(
     light, full = around.signal, np.any(around.full, axis=(1, 2))
     # the shapes of fainter stars are noise
     clearly_many = np.count_nonzero(height[bright] > BRIGHT) > ALIKE
-    bright, light = bright[~full], _select_light(light, ~full)
-    light, blur = grey(light, sky)
-    if clearly_many and len(bright):
-        alike = _most_alike(light)
-        bright, light = bright[alike], _select_light(light, alike)
-    shape = frame_shape(light, blur) if len(bright) else None
+    bright, (light, blur) = bright[~full], grey(light if not full.any() else light[~full], sky)
+    shape, alike = _typical_shape(light, blur, clearly_many)
+    bright = bright[alike]
     # a shape as wide as the stamps is the sky's
     if shape is not None and squared_widths(shape)[0, 0] > 0.9 * (SIGHT / 2) ** 2:
         shape = None
@@ -363,32 +365,29 @@ def _likeliest(stamps: Stamps, shape: np.ndarray | None, response: Response) -> 
     return choices[0 if learnt else best], learnt
 
 
-def _select_light(light: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """The signals (N, S, S) that a mask (N,) selects; if it selects all, nothing is copied."""
-    return light if which.all() else light[which]
+def _typical_shape(light: np.ndarray, blur: float, many: bool) -> tuple[np.ndarray | None, np.ndarray]:
+    """The covariance (1, 2, 2) px2 of most stars, signals (N, S, S), and which have similar shapes, (N,) bool.
 
-
-def _most_alike(light: np.ndarray) -> np.ndarray:
-    """Select the signals (N, S, S), (N,) bool, with similar shapes, as stars have and twigs have not.
-
-    All of them if most lie near the median shape, else those near the shape at which they are densest.
+    Stars have, and twigs have not: of many stars, those are left out that lie far from the median shape, or, if most
+    do, from the shape at which they are densest. blur, px2, is what smoothing added. None if no star can be measured.
     """
     reach = light.shape[1] // 2
-    widest = (reach / 2) ** 2
+    widest, alike = (reach / 2) ** 2, np.ones(len(light), bool)
     shape, values = own_shapes(
         light, (reach / 4) ** 2, NARROWEST_WINDOW, NARROWEST, widest, OWN_ROUNDS, CENTRINGS, FARTHEST
     )
-    xx, xy, yy = (shape[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    look = np.stack([np.log(xx + yy) / 2, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)])
-    off = look - np.array([[median(kind)] for kind in look])
-    alike = (off**2).sum(0) < LIKENESS**2
-    look = look.T
-    alike &= values[:, 0] > NARROWEST
     sound = (values[:, 0] > NARROWEST) & (values[:, 1] < widest)
-    if np.count_nonzero(alike) > 0.5 * len(alike) or np.count_nonzero(sound) < ALIKE:
-        return np.ones(len(alike), bool)
-    densest = np.argmin(spatial.cKDTree(look[sound]).query(look[sound], ALIKE)[0][:, -1])
-    return sound & (np.linalg.norm(look - look[sound][densest], axis=1) < LIKENESS)
+    if many and np.count_nonzero(sound) >= ALIKE:
+        xx, xy, yy = (shape[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        look = np.stack([np.log(xx + yy) / 2, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)], 1)
+        near = np.linalg.norm(look - np.median(look, axis=0), axis=1) < LIKENESS
+        if np.count_nonzero(near & (values[:, 0] > NARROWEST)) <= 0.5 * len(light):
+            densest = np.argmin(spatial.cKDTree(look[sound]).query(look[sound], ALIKE)[0][:, -1])
+            alike = sound & (np.linalg.norm(look - look[sound][densest], axis=1) < LIKENESS)
+    if not (sound & alike).any():
+        return None, alike
+    typical = np.median(shape[sound & alike], axis=0)[None]
+    return clip_widths(typical - blur * np.eye(2), NARROWEST, np.inf, 1.0), alike
 
 
 def reach_of(psf: Psf) -> int:

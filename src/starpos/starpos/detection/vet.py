@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from scipy import spatial
 
-from starpos.detection._moments import squared_widths, window_moments
+from starpos.detection._moments import relative_widths, squared_widths, window_moments
 from starpos.detection._vetting import compare_with_pixel, correct_sky, replace_spikes
 from starpos.detection.background import SkyPlane
 from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars, split_pairs, surprising
@@ -20,7 +20,6 @@ from starpos.detection.stamps import (
     centroid,
     cut,
     joined,
-    relative_widths,
     window_for,
 )
 from starpos.frames.frame import BLENDED, EDGE, ELONGATED, SATURATED
