@@ -250,11 +250,11 @@ def _first_places(stamps: Stamps, fit: Fit, psf: Psf) -> np.ndarray:
     """First places (2, 2, N) px of pairs: the star's, and the pixel off its centre where its fit leaves most light."""
     light = ndimage.gaussian_filter(fit.residual * stamps.good, (0, SMOOTHED_PX, SMOOTHED_PX))
     (left, top), grid = stamps.corner(fit.x, fit.y), np.arange(stamps.size)
-    apart = np.stack(
-        np.broadcast_arrays((left[:, None] + grid)[:, None], (top[:, None] + grid)[..., None]), -1
+    dx, dy = (left[:, None] + grid)[:, None], (top[:, None] + grid)[..., None]
+    u, v = (
+        i[:, None, None] * dx + j[:, None, None] * dy for i, j in psf.at(fit.x, fit.y).axes.transpose(1, 2, 0)
     )
-    widths = np.linalg.norm(apart @ psf.at(fit.x, fit.y).axes.swapaxes(1, 2)[:, None], axis=-1)
-    light[(np.linalg.norm(apart, axis=-1) < NEAREST_PX) | (widths >= FIT_WIDTHS + 2)] = -np.inf
+    light[(dx * dx + dy * dy < NEAREST_PX**2) | (u * u + v * v >= (FIT_WIDTHS + 2) ** 2)] = -np.inf
     row, column = np.divmod(light.reshape(len(light), -1).argmax(1), stamps.size)
     left, top = stamps.x - stamps.reach, stamps.y - stamps.reach
     return np.array([[fit.x, left + column], [fit.y, top + row]])
