@@ -11,10 +11,12 @@ import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from starpos.errors import FrameError
+from starpos.files import rows_of
 from starpos.frames.tiff import exif_block, tiff_directory
 
 # names of inclinometers (instrument/sensors.py)
@@ -165,31 +167,8 @@ def _canon(note: _Note) -> Gravity | None:
     return _level(-roll / 10, pitch / 10, 0.1)
 
 
-# Tag 0x91 of Nikon is enciphered from its fifth byte on: where the offset of its three angles stands, by its first four
-# bytes. D810; D5, D500, D7500, D850; D780, D6; Z 6, 7, 50, 5, 6II, 7II, fc, 30; Z 8, 9; Z f, 6III, 50II, 5II. The D4S is
-# left out: the tables differ about its signs.
-NIKON_LEVELS: dict[bytes, int] = {
-    **dict.fromkeys((b"0233", b"0805", b"0806"), 0x84),
-    **dict.fromkeys((b"0238", b"0239", b"0242", b"0243"), 0xA0),
-    **dict.fromkeys((b"0245", b"0246"), 0x9C),
-    **dict.fromkeys((b"0800", b"0801", b"0802", b"0803", b"0804", b"0807"), 0x98),
-    **dict.fromkeys((b"0808", b"0809", b"0810", b"0811"), 0x88),
-}
-# Constants of the cipher, one of 256 by the serial number, one by the number of releases.
-BY_SERIAL = bytes.fromhex(
-    "c1bf6d0d59c5139d83616b4fc77f3d3d5359e3c7e92f95a7951fdf7f2b29c70ddf07ef71893d133d3b13fb0d89c1651fb30d6b29"
-    "e3fbefa36b477f9535a7474fc7f1599535112961f13db32b0d4389c19d9d8965f1e9dfbf3d7f5397e5e995171d3d8bfbc7e367a7"
-    "07f171a753b52989e52ba71729e94fc5656d6bef0d89492fb34353651d49a3138959ef6bef651d0b5913e34f9db329432b071d95"
-    "595947fbe5e961472f357f177fef7f959571d3a30b71a3ad0b3bb5fba3bf4f831dade92f7165a3e507353d0db5e9e5473b9def35"
-    "a3bfb3df53d397534971073561712f432f11df1797fb953b7f6bd325bfadc7c5c5b58bef2fd3076b25499525496d71c7"
-)
-BY_RELEASES = bytes.fromhex(
-    "a7bcc9ad91df85e5d478d517467c294c4d03e925681186b3bdf76f6122a226342abe1e4614689d4418c240f47e5f1bad0b94b667"
-    "b40be1ea959c66dce75d6c05dad5df7aeff6db1f824cc06847a1bdee3950564adddfa5f8c6daca90ca01429d8b0c7343750594de"
-    "24b38034e52cdc9b3fca3345d0db5ff552c321dae222726b3ed05ba8878c065d0fdd091993d0b9fc8b0f8460331c9b45f1f0a394"
-    "3a1277334d4478283c9efd655716946bfb59d0c82236dbd2639843a1048786f7a626bbd6594dbf6a2eaa2befe678b64ee02fdc7c"
-    "be5719327e2ad0b8ba29003c527da8493b2deb2549faa3aa39a7c5a7501136fbc6674af5a512657eb0dfaf4eb3617f2f"
-)
+# Tag 0x91 of Nikon is enciphered from its fifth byte on.
+NIKON = Path(__file__).with_name("data") / "nikon.yaml"
 # ShutterMode of pictures that are taken of a film
 FILMED = 96
 # of a serial number
@@ -202,13 +181,14 @@ def _nikon(note: _Note) -> Gravity | None:
     if not {0x1D, 0x91, 0xA7} <= tags.keys() or tags.get(0x34) == (FILMED,):
         return None
     block, serial = bytes(tags[0x91]), _text(tags[0x1D])
-    if block[:4] not in NIKON_LEVELS:
+    level_at = rows_of(NIKON)["level_at"].get(block[:4].decode("ascii", "replace"))
+    if level_at is None:
         raise FrameError("it is by a Nikon whose level no public table describes")
     plain = _deciphered(block, int(serial[:MOST_DIGITS]), tags[0xA7][0])
     # the version of its firmware
     if not re.match(rb"\d[\d.]", plain[4:]):
         raise ValueError("another serial number or number of releases")
-    (at,) = struct.unpack_from("<I", plain, NIKON_LEVELS[block[:4]])
+    (at,) = struct.unpack_from("<I", plain, level_at)
     roll, pitch = (_signed(value, 360 << 16) / (1 << 16) for value in struct.unpack_from("<2I", plain, at))
     if abs(roll) > 45:
         raise FrameError(
@@ -219,9 +199,10 @@ def _nikon(note: _Note) -> Gravity | None:
 
 def _deciphered(block: bytes, serial: int, releases: int) -> bytes:
     """A block of Nikon in plain bytes; the releases of its shutter are the second part of the key."""
+    by_serial, by_releases = (bytes.fromhex(rows_of(NIKON)[name]) for name in ("by_serial", "by_releases"))
     step, sum_ = (
-        BY_SERIAL[serial & 255],
-        BY_RELEASES[np.bitwise_xor.reduce(list(struct.pack("<I", releases)))],
+        by_serial[serial & 255],
+        by_releases[np.bitwise_xor.reduce(list(struct.pack("<I", releases)))],
     )
     n = np.arange(len(block) - 4, dtype=np.uint32) + 0x60
     mask = (sum_ + step * np.cumsum(n, dtype=np.uint64)).astype(np.uint8)

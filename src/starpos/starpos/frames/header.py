@@ -12,63 +12,32 @@ import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from operator import itemgetter
+from pathlib import Path
 from typing import Any
 
 import erfa
+import numpy as np
 
 from starpos.errors import FrameError, TimeError, one_line
+from starpos.files import rows_of
 from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S, Exposure, Shutter
 from starpos.units import ARCSEC, DAY_S, UNIX_EPOCH_JD
 
-START, MIDDLE, END = (
-    ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG"),
-    ("DATE-AVG", "MJD-AVG"),
-    ("DATE-END", "MJD-END"),
+_CARDS = rows_of(Path(__file__).with_name("data") / "cards.yaml")
+START, MIDDLE, END, HOURS, DATES, LOCAL, ZONES = itemgetter(
+    "start", "middle", "end", "hours", "dates", "local", "zones"
+)(_CARDS)
+LENGTHS, COUNTS, PLATE_SCALES, SITES, AIMS = itemgetter("lengths", "counts", "plate_scales", "sites", "aims")(
+    _CARDS
 )
-# UTC of the start, where DATE-OBS or DATE-BEG is a day alone
-HOURS = (
-    "TIME-OBS",
-    "TIME-BEG",
-    "UT",
-    "UTSTART",
-    "UT-START",
-    "UTCSTART",
-    "UTC",
-    "UTC-OBS",
-    "UT-OBS",
-    "UTSHUT",
-)
-# Other cards with the UTC of some moment of the exposure, which have to agree with those above: dates as text or numbers
-DATES = ("DATE-UTC", "DATE_UTC", "DATE-GPS", "GPS-UTC", "GPS-TIME", "GPSTIME", "JD", "JD-OBS", "OBS-JD", "OBSJD",
-         "JD_UTC", "JD-UTC", "JDSTART", "JUL-DATE", "MJD", "MJD_OBS", "EXPSTART", "UNIXTIME")  # fmt: skip
-# a local time, and its zone: they show whether DATE-OBS is the local one
-LOCAL, ZONES = ("DATE-LOC", "DATE-LT", "LOCTIME", "LOCALTIM"), ("TIMEZONE", "TZ", "TIMEZ")
-# lengths in s: of one exposure (EXP: DWARF), then of all together (LIVETIME: Siril, TOTALEXP: Seestar)
-LENGTHS = ("EXPTIME", "EXPOSURE", "XPOSURE", "EXP", "LIVETIME", "TOTALEXP")
-# number of stacked exposures (Seestar and Siril, IRAF, MaxIm, infrared cameras, Astro Pixel Processor and others)
-COUNTS = ("STACKCNT", "NCOMBINE", "SNAPSHOT", "COADDS", "COADD", "NCOADD", "NCOADDS", "NFRAMES", "NSTACK", "NSTACKED",
-          "LIGH_CNT", "LUM_CNT", "NSUBEXP")  # fmt: skip
-# the second of a stack's inputs (IRAF); the kind of a frame
+# the keywords that are read
+KEYS = tuple(np.concatenate([np.ravel(keys) for keys in _CARDS.values()]).tolist())
+# the second of a stack's inputs; the kind of a frame
 SECOND_INPUT, KIND = "IMCMB002", "IMAGETYP"
 STACKED = re.compile(r"\b(master *(light)?|stack(ed)?|integration|co-?add(ed)?|sum(med)?)\b", re.IGNORECASE)
 # when the file was written, some time after the exposure; a local time may seem earlier
 WRITTEN = "DATE"
-TIME_KEYS = (
-    WRITTEN,
-    *START,
-    *MIDDLE,
-    *END,
-    *HOURS,
-    *DATES,
-    *LOCAL,
-    *ZONES,
-    *LENGTHS,
-    *COUNTS,
-    SECOND_INPUT,
-    KIND,
-    "TIMESYS",
-    "TIMEUNIT",
-)
 # Time scales of TIMESYS that are read; UT1 would need tables.
 TIME_SCALES = ("utc", "tai", "tt", "tdb", "gps")
 GPS_BEHIND_TAI_S = 19.0
@@ -105,32 +74,8 @@ CLOCK = re.compile(r"(\d\d?):(\d\d)(?::(\d\d(?:\.\d*)?))?", re.ASCII)
 LEAST_MJD, MOST_MJD, LEAST_JD, LEAST_UNIX_S = 3e4, 1e5, 2.43e6, 9e8
 # smallest step of an MJD's last digit: below it lie the last bits of a double
 MIN_MJD_STEP_S = 1e-3
-# Cards with the column and row of the sensor's frame at which a frame begins, in pixels of this frame, and their sign:
-# positive by SBFITSEXT (MaxIm, APT, Seestar and others), negative in IRAF's physical coordinates
-CROPS = ((("XORGSUBF", "YORGSUBF"), 1.0), (("LTV1", "LTV2"), -1.0))
-# IRAF's size of a pixel in physical ones
-LTM = ("LTM1_1", "LTM2_2")
-# arcsec per px, by INDI, Sequence Generator Pro and others
-PLATE_SCALES = ("SCALE", "PIXSCALE", "SECPIX1")
 # minimum of a focal length, a pixel or a scale that counts as stated
 LEAST = 1e-9
-# latitude and longitude of a site, deg: programs differ in the sign of the longitude
-SITES = (("SITELAT", "SITELONG"), ("LAT-OBS", "LONG-OBS"), ("OBSGEO-B", "OBSGEO-L"))
-# right ascension and declination of a pointing
-AIMS = (("RA", "DEC"), ("OBJCTRA", "OBJCTDEC"), ("TELRA", "TELDEC"))
-KEYS = (
-    *TIME_KEYS,
-    *(key for keys in (*SITES, *AIMS) for key in keys),
-    *(key for keys, _ in CROPS for key in keys),
-    *LTM,
-    *PLATE_SCALES,
-    "BAYERPAT",
-    "XBAYROFF",
-    "YBAYROFF",
-    "FOCALLEN",
-    "XPIXSZ",
-    "ROLLSHUT",
-)
 
 
 def read_exposure(header: Mapping, place: str, comments: Mapping[str, str] = NO_COMMENTS) -> Exposure:
@@ -187,11 +132,11 @@ def site_cards(header: Mapping) -> str:
 
 def origin_px(header: Mapping) -> tuple[float, float] | None:
     """Column and row of the sensor's frame at which a frame begins; None if nothing says so, NaN for no numbers."""
-    for keys, sign in CROPS:
+    for keys, sign in zip(_CARDS["crops"], (1.0, -1.0), strict=True):
         if any(header.get(key) not in (None, "") for key in keys):
             with suppress(TypeError, ValueError, OverflowError):
                 left, top = (sign * float(header.get(key) or 0) for key in keys)
-                scales = [float(header.get(key) or 1) for key in LTM if sign < 0]
+                scales = [float(header.get(key) or 1) for key in _CARDS["physical"] if sign < 0]
                 if math.isfinite(left) and math.isfinite(top) and all(scale == 1 for scale in scales):
                     return left + 0.0, top + 0.0
             return math.nan, math.nan
