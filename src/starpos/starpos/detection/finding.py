@@ -91,7 +91,7 @@ def _may_be_a_line(x: np.ndarray, y: np.ndarray) -> bool:
         np.sqrt(2) * (GAP + 2) * CELL, output_type="ndarray"
     )
     # all but the ends of a line have two neighbours
-    return np.count_nonzero(np.bincount(pairs.ravel()) > 1) >= FEWEST - 2
+    return bool(np.count_nonzero(np.bincount(pairs.ravel()) > 1) >= FEWEST - 2)
 
 
 def _through(points: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

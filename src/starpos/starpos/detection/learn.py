@@ -309,7 +309,7 @@ def _teachers(
     around = cut(sky, x[bright], y[bright], SIGHT)
     light, full = around.signal, np.any(around.full, axis=(1, 2))
     # the shapes of fainter stars are noise
-    clearly_many = np.count_nonzero(height[bright] > BRIGHT) > ALIKE
+    clearly_many = bool(np.count_nonzero(height[bright] > BRIGHT) > ALIKE)
     bright, (light, blur) = bright[~full], grey(light if not full.any() else light[~full], sky)
     shape, alike = _typical_shape(light, blur, clearly_many)
     bright = bright[alike]
@@ -432,15 +432,14 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
     weight = stamps.good * value / before.variance(stamps.noise, stamps.signal)
     phases = len(before.gain)
     of_phase = (phases * np.arange(len(value))[:, None, None] + stamps.phase).ravel()
-    own, information = (
+    light, information = (
         np.bincount(of_phase, (weight * v).ravel(), phases * len(value)).reshape(-1, phases)
         for v in (stamps.signal, value)
     )
     # of each phase its light by the PSF over the star's mean, and its variance
-    information = np.maximum(information, 1e-12)
-    own = own / information
-    mean = np.maximum(own.mean(1, keepdims=True), DARKEST_MEAN)
-    own, error2 = own / mean, 1 / np.maximum(information * mean**2, 1e-12)
+    flux: np.ndarray = light / np.maximum(information, 1e-12)
+    mean = np.maximum(flux.mean(1, keepdims=True), DARKEST_MEAN)
+    own, error2 = flux / mean, 1 / np.maximum(information * mean**2, 1e-12)
     gain, spread2 = np.median(own, axis=0), 0.0
     for _ in range(GAIN_ROUNDS):
         weight = 1 / (error2 + spread2 + 1e-6)
