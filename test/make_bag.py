@@ -103,7 +103,7 @@ def make(folder: Path) -> None:
     still = scene
     for n in range(round((END_S - START_S) / TILT_PERIOD_S)):
         moment = START_S + 0.05 + n * TILT_PERIOD_S + rng.uniform(-0.004, 0.004)
-        x, y = read_tilt(still, 0.0, rng)
+        x, y = read_tilt(still, rng)
         tilt = Tilt(
             x,
             y,

@@ -101,7 +101,7 @@ def reading(unix_s, gyro=(0, 0, 0), force=(0, 0, 9.8)):
 
 def send_stars_and_wheels(ears, record):
     for frame in record.frames:
-        seen, state = frame.placeless(), earth_state(frame.utc_unix_s)
+        seen, state = frame.camera, earth_state(frame.utc_unix_s)
         found = CameraAttitude(
             utc_unix_s=frame.utc_unix_s,
             stamp_stddev_s=0.0,

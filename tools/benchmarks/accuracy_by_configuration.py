@@ -113,7 +113,7 @@ def photograph(
             told = replace(scene, tilt_errors=replace(scene.tilt_errors, zero=tuple(off), scale=(0.0, 0.0)))
             for j in range(READINGS):
                 moment = now + (j + 0.5) * exposure_s / READINGS + world.clock_s
-                rows.append((moment, *read_tilt(told, 0.0, rng), 15.0 + warm))
+                rows.append((moment, *read_tilt(told, rng), 15.0 + warm))
             now += cadence_s
         now += TURN_S
     return stars, rows, faces

@@ -20,7 +20,7 @@ from table import Cost, Row
 
 from starpos.earth.orientation import earth_state
 from starpos.fix.attitude import CameraAttitude
-from starpos.navigation.sightings import IdentifiedFrame
+from starpos.navigation.sightings import PlacelessFrame
 from starpos_common.messages import attitude_to_message, unix_to_stamp
 from starpos_interfaces.msg import Attitude
 from starpos_testing.graph.graph import Graph
@@ -109,9 +109,9 @@ def reading(unix_s: float, gyro: list[float], force: list[float]) -> Imu:
     return message
 
 
-def attitude(frame: IdentifiedFrame) -> Attitude:
+def attitude(frame: PlacelessFrame) -> Attitude:
     """Make the message of a frame, as the solver publishes it."""
-    seen = frame.placeless()
+    seen = frame.camera
     found = CameraAttitude(
         utc_unix_s=frame.utc_unix_s,
         stamp_stddev_s=0.0,
@@ -119,7 +119,7 @@ def attitude(frame: IdentifiedFrame) -> Attitude:
         frame_id="camera",
         camera_to_gcrs=earth_state(frame.utc_unix_s).gcrs_to_itrs.T @ seen.rotation,
         covariance=seen.covariance_about_own,
-        stars=len(frame.xy),
+        stars=30,
         log_odds=50.0,
     )
     return attitude_to_message(found)

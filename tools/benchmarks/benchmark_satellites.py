@@ -21,7 +21,7 @@ from starpos.earth.gravity import itrs_place
 from starpos.errors import SatelliteError
 from starpos.rotation import normalised
 from starpos.satellites.adjustment import KnownBefore
-from starpos.satellites.elements import MANOEUVRING, PASSIVE, Orbit
+from starpos.satellites.elements import CLASSES, Orbit
 from starpos.satellites.locating import locate
 from starpos.satellites.naming import OrbitsAbove
 from starpos.satellites.orbits import Moments, along_axes, seen, states
@@ -33,7 +33,7 @@ SIGMA, EXPOSURE_S, HEIGHT_M, LEAST = 3 * ARCSEC, 1.0, 500.0, math.sin(math.radia
 HEIGHT_STDDEV_M, CLOCK_STDDEV_S = 20.0, 0.002
 AGES = 0.5, 1, 2, 4, 7, 10, 14, 21, 30
 # mean motions a day, and inclinations, of the two kinds
-KINDS = ((MANOEUVRING, 15.06, (53.0, 53.1)), (PASSIVE, 14.4, (65.0, 98.5)))
+KINDS = ((CLASSES["manoeuvring"], 15.06, (53.0, 53.1)), (CLASSES["passive"], 14.4, (65.0, 98.5)))
 
 
 def drawn_orbits(count: int, age_days: float, rng: np.random.Generator) -> list[Orbit]:
@@ -46,7 +46,9 @@ def drawn_orbits(count: int, age_days: float, rng: np.random.Generator) -> list[
         errors, per_day, inclinations = KINDS[k % 3 == 2]
         record = Satrec()
         turns = rng.uniform(0, 2 * math.pi, 3)
-        rate = (per_day + rng.normal(0, 0.01 if errors is MANOEUVRING else 0.3)) * 2 * math.pi / 1440
+        rate = (
+            (per_day + rng.normal(0, 0.01 if errors is CLASSES["manoeuvring"] else 0.3)) * 2 * math.pi / 1440
+        )
         inclination = math.radians(rng.uniform(*inclinations))
         days = epoch / DAY_S + UNIX_EPOCH_JD - 2433281.5
         record.sgp4init(

@@ -49,7 +49,7 @@ class Shot:
         start = START_S + 5.0 * number
         light = expose(self.scene, load_catalogue(), start, EXPOSURE_S, rng)
         self.stars: Stars = detected(self.scene, light, start + EXPOSURE_S / 2, EXPOSURE_S, rng)
-        x, y = read_tilt(self.scene, 0.0, rng)
+        x, y = read_tilt(self.scene, rng)
         sigma = self.scene.tilt_errors.noise
         self.tilt = Tilt(x, y, np.eye(2) * sigma**2, utc_unix_s=self.stars.mid_unix_s)
         self.solver = Solver(self.scene.instrument, load_catalogue(), self.scene.site.atmosphere)

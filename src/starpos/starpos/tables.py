@@ -11,6 +11,7 @@ import warnings
 from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,13 @@ import numpy as np
 from starpos.errors import StarposError, TimeError, one_line
 from starpos.files import open_regular
 from starpos.units import unix_of
+
+
+def packaged(package: str, name: str) -> list[dict[str, str]]:
+    """Rows of a CSV in the folder `data` of a package; lines that begin with # are remarks."""
+    text = resources.files(package).joinpath("data", name).read_text("utf-8")
+    return list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
+
 
 # an empty cell, other than a line's first
 EMPTY = re.compile(r",[ \t]*(?=[,\r\n]|\Z)")

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from starpos.instrument.camera import Camera
 from starpos.navigation.records import ImuLog, ImuModel, VelocityLog
-from starpos.navigation.sightings import IdentifiedFrame, roughly
+from starpos.navigation.sightings import PlacelessFrame, placeless
 
 # Unix, in November 2026.
 BEGIN_S = 1.7937e9
@@ -177,7 +177,7 @@ class MadeVoyage:
 
     imu: ImuLog
     velocity: VelocityLog
-    frames: list[IdentifiedFrame]
+    frames: list[PlacelessFrame]
     latitude: np.ndarray
     longitude: np.ndarray
     heading: np.ndarray
@@ -300,13 +300,15 @@ def _frame(utc_unix_s, camera_to_itrs, place, rng, on):
     # the diurnal aberration, to first order
     moving = SPIN * np.array([-place[1], place[0], 0.0]) / LIGHT_M_PER_S
     apparent = seen - (moving - (seen @ moving)[:, None] * seen)
-    return IdentifiedFrame(
+    optics = Camera(width=1, height=1, fx=FOCAL_PX, fy=FOCAL_PX, cx=0.0, cy=0.0)
+    return PlacelessFrame(
         utc_unix_s=utc_unix_s,
         stamp_stddev_s=0.0,
         source=f"frame {utc_unix_s:.1f}",
-        xy=xy + on * rng.normal(0, STAR_SIGMA_PX, xy.shape),
-        covariance_px2=np.tile(np.eye(2) * STAR_SIGMA_PX**2, (STARS, 1, 1)),
-        itrs=apparent / np.linalg.norm(apparent, axis=1)[:, None],
-        optics=Camera(width=1, height=1, fx=FOCAL_PX, fy=FOCAL_PX, cx=0.0, cy=0.0),
-        camera=roughly(camera_to_itrs),
+        camera=placeless(
+            xy + on * rng.normal(0, STAR_SIGMA_PX, xy.shape),
+            np.tile(np.eye(2) * STAR_SIGMA_PX**2, (STARS, 1, 1)),
+            optics,
+            apparent / np.linalg.norm(apparent, axis=1)[:, None],
+        ),
     )

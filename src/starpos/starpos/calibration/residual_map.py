@@ -51,7 +51,9 @@ def draw_residuals(axes: "Axes", xy: np.ndarray, residual: np.ndarray, width: in
     More than MAX_ARROWS stars are drawn as the means of cells with MIN_IN_CELL or more.
     """
     if len(xy) > MAX_ARROWS:
-        xy, residual = _Cells(xy, ARROW_CELLS, width, height).means(xy, residual)
+        means = _means(xy, np.hstack([xy, residual]), ARROW_CELLS, width, height)[1].reshape(4, -1)
+        filled = means[:, np.isfinite(means[0])]
+        xy, residual = filled[:2].T, filled[2:].T
     usual = float(np.median(np.hypot(*residual.T))) if len(residual) else 0.0
     key = _round_number(usual) if usual > 0 else 1.0
     per_px = key / (USUAL_ARROW * max(width, height) / ARROW_CELLS)
@@ -64,39 +66,22 @@ def draw_residuals(axes: "Axes", xy: np.ndarray, residual: np.ndarray, width: in
 
 def draw_rms(axes: "Axes", xy: np.ndarray, residual: np.ndarray, width: int, height: int) -> "QuadMesh":
     """Colour square cells of a frame by the rms of their residuals (N, 2) px; returns the image for a colour bar."""
-    cells = _Cells(xy, COLOUR_CELLS, width, height)
-    (square,) = cells.means(np.square(residual).mean(1))
-    colour = np.full(len(cells.count), np.nan)
-    colour[cells.filled] = np.sqrt(square)
-    edges = [np.arange(n + 1) * cells.size - 0.5 for n in cells.shape]
-    image = axes.pcolormesh(edges[1], edges[0], colour.reshape(cells.shape), cmap="viridis", vmin=0)
+    (rows, columns), means = _means(xy, np.square(residual).mean(1)[:, None], COLOUR_CELLS, width, height)
+    image = axes.pcolormesh(columns, rows, np.sqrt(means[0]), cmap="viridis", vmin=0)
     _frame(axes, width, height)
     return image
 
 
-class _Cells:
-    """Square cells over a frame, `along` of them on its longer side.
-
-    cell (N,): the cell of each star; count, filled: number of stars per cell, and whether they are enough.
+def _means(
+    xy: np.ndarray, values: np.ndarray, along: int, width: int, height: int
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Edges in px of the rows and columns of square cells over a frame, `along` of them on its longer side, and in each
+    the means (k, rows, columns) of values (N, k) at xy (N, 2) px; NaN in cells with fewer than MIN_IN_CELL.
     """
-
-    def __init__(self, xy: np.ndarray, along: int, width: int, height: int):
-        self.size = max(width, height) / along
-        self.shape = int(np.ceil(height / self.size)), int(np.ceil(width / self.size))
-        last = [self.shape[1] - 1, self.shape[0] - 1]
-        column, row = np.clip(np.floor((xy + 0.5) / self.size).astype(int), 0, last).T
-        self.cell = row * self.shape[1] + column
-        self.count = np.bincount(self.cell, minlength=self.shape[0] * self.shape[1])
-        self.filled = self.count >= MIN_IN_CELL
-
-    def means(self, *values: np.ndarray) -> list[np.ndarray]:
-        """Means (M, ...) over the filled cells of each array (N, ...)."""
-        return [self._mean(v) for v in values]
-
-    def _mean(self, v: np.ndarray) -> np.ndarray:
-        total = np.zeros((len(self.count), *v.shape[1:]))
-        np.add.at(total, self.cell, v)
-        return total[self.filled] / self.count[self.filled].reshape(-1, *[1] * (v.ndim - 1))
+    size = max(width, height) / along
+    edges = [np.arange(np.ceil(side / size) + 1) * size - 0.5 for side in (height, width)]
+    count, *sums = (np.histogram2d(xy[:, 1], xy[:, 0], bins=edges, weights=w)[0] for w in (None, *values.T))
+    return edges, np.where(count < MIN_IN_CELL, np.nan, np.array(sums) / np.maximum(count, 1))
 
 
 def _round_number(value: float) -> float:

@@ -67,7 +67,7 @@ def _one_line_each(complain: Callable[[str], None]) -> Callable[..., None]:
 
 
 def parser_for(given: Sequence[str]) -> CommandParser:
-    """The parser of a call; of the commands only the one in use is imported, so that --help is quick."""
+    """The parser of a call; only the options of the command in use are read, so that --help is quick."""
     parser = CommandParser(
         prog="starpos",
         description="Position and heading from the stars.",
@@ -79,8 +79,7 @@ def parser_for(given: Sequence[str]) -> CommandParser:
     for name, text in COMMANDS.items():
         sub = choice.add_parser(name, help=text)
         if given and given[0] == name:
-            command = import_module("starpos.cli.commands").command_of(name)
-            command.define(sub, import_module(f"starpos.cli.{name.replace('-', '_')}"))
+            import_module("starpos.cli.commands").command_of(name).define(sub)
     return parser
 
 
@@ -120,18 +119,28 @@ def main(argv: list[str] | None = None) -> int:
     guard_surroundings()
     try:
         args = parser_for(given).parse_args(given)
+        run = run_of(args)
+        # it loads numpy, as commands do
+        console = import_module("starpos.cli.console")
     except ModuleNotFoundError as e:
         print(
             f"starpos: the module {e.name} is not here: starpos doctor says what is missing", file=sys.stderr
         )
         return BAD_CALL
-    # it loads numpy, as the command in use does
-    console = import_module("starpos.cli.console")
     with console.speaking(args.command):
-        return _run(args, console.complain)
+        return _run(args, run, console.complain)
 
 
-def _run(args: argparse.Namespace, complain: Callable[[object], None]) -> int:
+def run_of(args: argparse.Namespace) -> Callable[[argparse.Namespace], int]:
+    """The function of a call, of the command's module: `run`, for a kind of the command `run_KIND`."""
+    module = import_module(f"starpos.cli.{args.command.replace('-', '_')}")
+    kind = getattr(args, "kind", None)
+    return getattr(module, "run" if kind is None else f"run_{kind}")
+
+
+def _run(
+    args: argparse.Namespace, run: Callable[[argparse.Namespace], int], complain: Callable[[object], None]
+) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _one_line_each(complain)
@@ -142,7 +151,7 @@ def _run(args: argparse.Namespace, complain: Callable[[object], None]) -> int:
             if getattr(args, "instrument", None) is not None:
                 import_module("starpos.cli.options").fill_site(args)
             import_module("starpos.cli.commands").check_call(args)
-            status: int = args.run(args)
+            status = run(args)
         # a reader that has gone must be noticed here, and not while the interpreter ends
         sys.stdout.flush()
         return status

@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from starpos.cli import COMMANDS
@@ -40,13 +39,8 @@ class Command:
     options: Mapping[str, dict | None] = field(default_factory=dict)
     kinds: Mapping[str, dict] = field(default_factory=dict)
 
-    def define(
-        self, parser: argparse.ArgumentParser, module: ModuleType | None = None, run: str = "run"
-    ) -> argparse.ArgumentParser:
-        """Add its options, and return the parser.
-
-        run: the function of the module that it calls, for a kind with _KIND behind the name.
-        """
+    def define(self, parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+        """Add its options, and return the parser."""
         parser.formatter_class = argparse.RawDescriptionHelpFormatter
         parser.description = self.description or f"{self.text[0].upper()}{self.text[1:]}."
         examples = "".join(f"  {example}\n" for example in self.examples)
@@ -61,9 +55,7 @@ class Command:
             )
             for name, row in self.kinds.items():
                 kind = Command(**row)
-                kind.define(kinds.add_parser(name, help=kind.text), module, f"{run}_{name}")
-        if hasattr(module, run):
-            parser.set_defaults(run=getattr(module, run))
+                kind.define(kinds.add_parser(name, help=kind.text))
         return parser
 
 

@@ -19,7 +19,7 @@ from starpos.night.reading import First
 from starpos.night.remarks import of_inclinometer
 from starpos.night.work import OnFile
 from starpos.units import ARCSEC, utc_text
-from starpos.zenith.adjustment import DeflectionSession, FaceQuality, Reduced, reduced
+from starpos.zenith.adjustment import DeflectionSession, FaceQuality, reduced
 from starpos.zenith.doubts import checked_session, remarks
 from starpos.zenith.sighting import ZenithSighting
 
@@ -58,7 +58,9 @@ def frame_line(value: dict) -> str:
     )
 
 
-def combined_json(found: DeflectionSession, without: Reduced, mark: Place, station: str) -> dict:
+def combined_json(
+    found: DeflectionSession, without: dict[str, np.ndarray], mark: Place, station: str
+) -> dict:
     """The session's value; station: name of the mark, '' for none."""
     sigma_xi, sigma_eta = found.sigma_arcsec
     return {
@@ -86,12 +88,7 @@ def combined_json(found: DeflectionSession, without: Reduced, mark: Place, stati
         "catalogue_factor": found.catalogue_factor,
         "chi2_per_degree": found.chi2_per_degree,
         "misalignment_deg": found.misalignment_deg,
-        "reduced": {
-            "tide_arcsec": without.tide_arcsec,
-            "curvature_arcsec": [without.curvature_arcsec, 0.0],
-            "mark_arcsec": without.mark_arcsec,
-            "geoid_arcsec": without.geoid_arcsec,
-        },
+        "reduced": without,
         "by_face": [_face_json(face) for face in found.face_quality],
         "stars": len(found.stars),
     }

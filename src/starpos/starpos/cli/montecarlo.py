@@ -97,7 +97,7 @@ def _print_head(conditions: montecarlo_fields.Conditions, stars: Catalogue) -> N
 
 
 def _print_row(label: str, paper: str, t: montecarlo_fields.Tally, as_json: bool) -> None:
-    low, high = montecarlo_fields.wilson(t.correct, t.fields)
+    low, high = t.interval
     median, worst = (float(f(t.cpu_ms)) if t.cpu_ms else float("nan") for f in (np.median, np.max))
     if as_json:
         console.print_json(

@@ -11,7 +11,6 @@ from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.earth.refraction import Atmosphere
-from starpos.fix._adjustment import gain_of, spread
 from starpos.fix.attitude import ENU, LINK, Attitude, heading_row
 from starpos.fix.terms import ALWAYS, EACH_POSE, ErrorTerm, Origin, total_covariance
 from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
@@ -112,43 +111,6 @@ def mount_term(name: str, link_to_enu: np.ndarray, stddev: float) -> tuple[Error
         return ()
     factor = np.vstack([np.zeros((2, 3)), heading_row(link_to_enu), np.eye(3)]) * stddev
     return (ErrorTerm(name, factor, shared=ALWAYS),)
-
-
-@at_once
-@dataclass(frozen=True)
-class StarErrors:
-    """Errors of the stars of a fix.
-
-    gain (3, N, 2): rotation of A4 in rad for an error of one pixel of each star.
-    centroids, catalogue (N, 2, 2): covariances in px2.
-    same_stars: keys of the stars; frames that share them share the errors of the catalogue.
-    """
-
-    gain: np.ndarray
-    centroids: np.ndarray
-    catalogue: np.ndarray
-    same_stars: tuple
-
-    @classmethod
-    def of(
-        cls, slope: np.ndarray, centroids: np.ndarray, catalogue: np.ndarray, same_stars: tuple
-    ) -> "StarErrors":
-        """Errors after weighted least squares.
-
-        slope (N, 2, 4): derivatives in px of the parameters, of which the first three rotate A4.
-        """
-        whole = np.ascontiguousarray(centroids + catalogue)
-        return cls(gain_of(np.ascontiguousarray(slope), whole), centroids, catalogue, same_stars)
-
-    def rotated(self, errors_px: np.ndarray) -> np.ndarray:
-        """Rotation (3, ...) of A4 in rad that errors (N, 2, ...) of the predicted places in px make."""
-        # the gain is for errors of the seen places, which have the opposite sign
-        number = 2 * len(errors_px)
-        return -self.gain.reshape(3, number) @ errors_px.reshape(number, *errors_px.shape[2:])
-
-    def rotation_covariance(self, covariance: np.ndarray) -> np.ndarray:
-        """Covariance (3, 3) in rad2 of A4's rotation, from the covariances (N, 2, 2) in px2 of independent stars."""
-        return spread(self.gain, np.ascontiguousarray(covariance))
 
 
 def tilt_terms(

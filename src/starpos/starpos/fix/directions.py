@@ -40,7 +40,7 @@ class Horizontal:
         return np.sqrt(self.covariance[:, 1, 1])
 
 
-def _basis(v: np.ndarray) -> np.ndarray:
+def axes_across(v: np.ndarray) -> np.ndarray:
     """Unit vectors (N, 2, 3) across and up at directions v (N, 3): to larger azimuths, and to larger altitudes."""
     level = np.maximum(np.hypot(v[:, 0], v[:, 1]), 1e-12)[:, None]
     across = np.stack([v[:, 1], -v[:, 0], np.zeros(len(v))], -1) / level
@@ -54,7 +54,7 @@ def horizontal(to_enu: Attitude, directions: np.ndarray, sigma: float | np.ndarr
     """
     v = np.atleast_2d(directions) @ to_enu.rotation.T
     # a small rotation w moves v by w x v, which is w . (v x e) along e
-    slope = np.cross(v[:, None], _basis(v))
+    slope = np.cross(v[:, None], axes_across(v))
     own = np.eye(2) * np.square(np.broadcast_to(sigma, len(v)))[:, None, None]
     return Horizontal(
         azimuth=np.arctan2(v[:, 0], v[:, 1]) % (2 * math.pi),
@@ -65,8 +65,7 @@ def horizontal(to_enu: Attitude, directions: np.ndarray, sigma: float | np.ndarr
 
 def towards(azimuth: np.ndarray, altitude: np.ndarray) -> np.ndarray:
     """Unit vectors (N, 3) in east, north, up of azimuths and altitudes (N,) in rad."""
-    level = np.cos(altitude)
-    return np.stack([level * np.sin(azimuth), level * np.cos(azimuth), np.sin(altitude)], -1)
+    return rotation.unit_vector(math.pi / 2 - azimuth, altitude)
 
 
 # a mount that has turned by less than this shows no axis
@@ -96,7 +95,7 @@ class MountAxis:
         north = latitude >= 0
         pole = towards(np.array([0.0 if north else math.pi]), np.array([abs(latitude)]))[0]
         turn = rotation.to_vector(rotation.shortest_turn(pole, self.direction))
-        return np.asarray(_basis(pole[None])[0] @ np.cross(turn, pole))
+        return np.asarray(axes_across(pole[None])[0] @ np.cross(turn, pole))
 
 
 def mount_axis(attitudes: Sequence[Attitude]) -> MountAxis:
@@ -120,7 +119,7 @@ def mount_axis(attitudes: Sequence[Attitude]) -> MountAxis:
     n, m = u[:, 0], vt[0]
     for _ in range(ROUNDS):
         left, right, chi2 = np.zeros((4, 4)), np.zeros(4), 0.0
-        of_n, of_m = _basis(n[None])[0], np.linalg.svd(m[None])[2][1:]
+        of_n, of_m = axes_across(n[None])[0], np.linalg.svd(m[None])[2][1:]
         for a in attitudes:
             seen = a.rotation @ m
             slope = np.cross(seen, of_n)
@@ -140,7 +139,7 @@ def mount_axis(attitudes: Sequence[Attitude]) -> MountAxis:
         )
     free = 2 * len(attitudes) - 4
     covariance = np.linalg.inv(left)[:2, :2] * (max(1.0, chi2 / free) if free else 1.0)
-    slope = np.cross(n, _basis(n[None])[0])
+    slope = np.cross(n, axes_across(n[None])[0])
     shared = [a.covariance - a.unshared for a in attitudes]
     covariance = covariance + slope @ np.mean(shared, axis=0) @ slope.T
     sign = 1.0 if n[2] >= 0 else -1.0

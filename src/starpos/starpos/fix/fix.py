@@ -4,8 +4,10 @@ covariance.
 """
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +34,7 @@ from starpos.frames.tables import Pointing
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.mounting import LocalLevel
 from starpos.units import ARCSEC
 
 # lengths from here on are given in km
@@ -194,30 +197,31 @@ class Fix(PlaceFix, FittedSighting):
         return axes.T @ of_stars[:2, :2] @ axes
 
 
-def solve_fix(stars: MatchedStars, tilt: Tilt, about: Circumstances) -> Fix:
-    """The fix of one frame from identified stars; FixError if the stars are too few or do not agree."""
-    mounting, refraction = about.mounting, about.atmosphere.refraction()
-    level = mounting.level(tilt)
-    g = level.camera
-    seen = fit_stars(stars, about.camera, g, refraction, apparent(stars, about))
-    a4 = seen.fit.a4
-    place = local_north(a4)
-    link_to_enu = place.local_to_enu @ g @ mounting.link_to_camera
+def levelled_fix(
+    seen: dict[str, Any],
+    a4: np.ndarray,
+    level: LocalLevel,
+    tilt: Tilt,
+    about: Circumstances,
+    terms_of: Callable[[np.ndarray], Iterable[ErrorTerm]],
+) -> Fix:
+    """The fix by a level and A4 (3, 3), ITRS into the level's axes L; seen: the fields that say what the frame shows.
+
+    terms_of: the terms of what is seen, by the factors' rows (6, 3) for a small rotation of the sky about L's axes.
+    """
+    mounting, place = about.mounting, local_north(a4)
+    link_to_enu = place.local_to_enu @ level.camera @ mounting.link_to_camera
     of_sky, of_level = sky_rows(place), level_rows(place, link_to_enu)
     # the two axes go with the inclinometer, however it leans
     axes = rotation.shortest_turn(np.array([0.0, 0.0, 1.0]), level.up)[:, :2]
-    centroids, catalogue, *of_air = seen.terms(of_sky, about)
     terms = (
-        centroids,
-        catalogue,
+        *terms_of(of_sky),
         *tilt_terms(of_level, level, tilt, mounting, about.earth.utc_unix_s),
-        *of_air,
-        *lens_term(of_sky, g, mounting),
         *sky_terms(of_sky, about.earth, about.clock_stddev_s, about.stamp_stddev_s, a4),
         *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
     )
     return Fix(
-        **fitted_fields(seen, about, g, a4),
+        **seen,
         tilt=tilt,
         latitude=place.latitude,
         longitude=place.longitude,
@@ -226,6 +230,19 @@ def solve_fix(stars: MatchedStars, tilt: Tilt, about: Circumstances) -> Fix:
         terms=terms,
         levelling=of_level @ (level.turns @ axes),
     )
+
+
+def solve_fix(stars: MatchedStars, tilt: Tilt, about: Circumstances) -> Fix:
+    """The fix of one frame from identified stars; FixError if the stars are too few or do not agree."""
+    level = about.mounting.level(tilt)
+    g = level.camera
+    seen = fit_stars(stars, about.camera, g, about.atmosphere.refraction(), apparent(stars, about))
+
+    def terms_of(rows: np.ndarray) -> tuple[ErrorTerm, ...]:
+        return *seen.terms(rows, about), *lens_term(rows, g, about.mounting)
+
+    a4 = seen.fit.a4
+    return levelled_fix(fitted_fields(seen, about, g, a4), a4, level, tilt, about, terms_of)
 
 
 # the camera that sees the stars, in place of an unknown one: only its axes count

@@ -184,9 +184,7 @@ def _zenith_shown(seen: StarFit, leaned: np.ndarray, atmosphere: Atmosphere) -> 
     kept = seen.fit.kept
     moved = (leaned[kept] - (seen.problem.xy + seen.fit.residual)[kept, :, None]) / STEP_RAD
     found, covariance = seen.more(moved, atmosphere)
-    return confirms_hour(
-        *checked_zenith(found, covariance * feigned(seen.fit.jitter2, seen.errors.centroids))
-    )
+    return confirms_hour(*checked_zenith(found, covariance * feigned(seen.fit.jitter2, seen.centroids)))
 
 
 def confirms_hour(lean: float, sigma: float) -> bool:

@@ -57,22 +57,34 @@ class FittedSighting(Sighting):
     ut1_minus_utc_s: float
 
 
-def fitted_fields(seen: StarFit, about: Circumstances, g: np.ndarray, a4: np.ndarray) -> dict[str, Any]:
-    """The fields of a FittedSighting that a fit gives; g (3, 3): C into L, a4 (3, 3): ITRS into L."""
-    fit, earth, axis = seen.fit, about.earth, g @ about.camera.centre_ray
-    error = seen.errors.rotation_covariance(seen.errors.centroids)
+def seen_fields(about: Circumstances, g: np.ndarray, a4: np.ndarray, own: np.ndarray) -> dict[str, Any]:
+    """The fields of a FittedSighting whatever is seen, without stars; g (3, 3): C into L, a4 (3, 3): ITRS into L.
+
+    own (3, 3): covariance in rad2, about L's axes, of the errors of what this frame sees.
+    """
+    earth, axis = about.earth, g @ about.camera.centre_ray
     return {
         "utc_unix_s": earth.utc_unix_s,
         "clock_stddev_s": about.clock_stddev_s,
         "stamp_stddev_s": about.stamp_stddev_s,
-        "camera": Attitude(a4.T @ g, a4.T @ error @ a4, of=CAMERA, into=ITRS),
-        "used": np.flatnonzero(fit.keep),
-        "residual_px": seen.residual,
-        "residual_arcsec": seen.residual_px * about.camera.scale_arcsec,
-        "jitter_px": math.sqrt(fit.jitter2),
-        "focal_scale": fit.scale,
+        "camera": Attitude(a4.T @ g, a4.T @ own @ a4, of=CAMERA, into=ITRS),
         "zenith_distance": math.acos(min(max(axis[2], -1.0), 1.0)),
         "refraction_arcsec": math.dist(axis, about.atmosphere.refraction().unbend(axis)) / ARCSEC,
         "diurnal_aberration_arcsec": math.hypot(*station_velocity(a4[2])) / ARCSEC,
         "ut1_minus_utc_s": earth.orientation.ut1_minus_utc_s,
+        "used": np.zeros(0, int),
+        "residual_px": np.zeros((0, 2)),
+        "jitter_px": 0.0,
+        "focal_scale": 1.0,
+    }
+
+
+def fitted_fields(seen: StarFit, about: Circumstances, g: np.ndarray, a4: np.ndarray) -> dict[str, Any]:
+    """The fields of a FittedSighting that a fit of stars gives; g, a4 as of `seen_fields`."""
+    return seen_fields(about, g, a4, seen.own) | {
+        "used": np.flatnonzero(seen.fit.keep),
+        "residual_px": seen.residual,
+        "residual_arcsec": seen.residual_px * about.camera.scale_arcsec,
+        "jitter_px": math.sqrt(seen.fit.jitter2),
+        "focal_scale": seen.fit.scale,
     }

@@ -209,11 +209,12 @@ class Solver:
         predicted, hint: where to look, the latter of an earlier solution; a wrong one costs 0.5 ms and does no harm.
         known: an identification of these stars, or a hint outside of which they are not to be searched.
         """
-        if (rows := self._inside(stars)) is not None:
-            if isinstance(known, Identification):
-                known = known.but(star=np.searchsorted(rows, known.star))
-            return self.solve(stars.select(rows), tilts, hint, predicted, known).among(stars, rows)
         try:
+            whole = self.instrument.camera_for(stars.width, stars.height, stars.origin_px)
+            if (rows := inside(stars, whole)) is not None:
+                if isinstance(known, Identification):
+                    known = known.but(star=np.searchsorted(rows, known.star))
+                return self.solve(stars.select(rows), tilts, hint, predicted, known).among(stars, rows)
             state, tilt = self.levelled(stars, tilts)
             camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
             g = self.instrument.mounting.level(tilt).camera
@@ -235,7 +236,7 @@ class Solver:
         answer, done = solution_of(stars, field, sky, camera, found, begin), time.perf_counter()
         try:
             check_explained(answer)
-            fix = self._fix(stars, found, camera, tilt, state, catalogue)
+            fix = self._fix(stars, found, tilt, state)
         except StarposError as e:
             return replace(answer, tilt=tilt, status=status_of(stars, e), message=str(e))
         return replace(
@@ -305,17 +306,10 @@ class Solver:
             raise TiltError(EITHER_WAY)
         return replace(tilt if sine > 0 else tilt.reversed, either_way=False)
 
-    def _fix(
-        self,
-        stars: Stars,
-        found: Identification,
-        camera: Camera,
-        tilt: Tilt,
-        state: EarthState,
-        catalogue: Catalogue,
-    ) -> Fix:
+    def _fix(self, stars: Stars, found: Identification, tilt: Tilt, state: EarthState) -> Fix:
+        camera, _, _ = self.view(stars.width, stars.height, stars.origin_px)
         up = self.instrument.mounting.level(tilt).camera[2]
-        use, matched = self._matched(stars, found, camera, up, state, catalogue)
+        use, matched = self._matched(stars, found, up, state)
         if fisheye.is_wide(camera):
             detected = directions_of(camera, stars) @ up
             sines = detected[found.star]
@@ -331,13 +325,7 @@ class Solver:
         return replace(fix, used=np.flatnonzero(use)[fix.used])
 
     def _matched(
-        self,
-        stars: Stars,
-        found: Identification,
-        camera: Camera,
-        up: np.ndarray,
-        state: EarthState,
-        catalogue: Catalogue,
+        self, stars: Stars, found: Identification, up: np.ndarray, state: EarthState
     ) -> tuple[np.ndarray, MatchedStars]:
         """Mask (M,) of the identified stars to use, and these; up (3,): rough zenith in C."""
         if len(found.star) < self.min_stars:
@@ -346,6 +334,7 @@ class Solver:
             raise InstrumentError(
                 "the frame is mirrored (its rows run bottom-up): flip it, a position needs to know which side is up"
             )
+        camera, catalogue, _ = self.view(stars.width, stars.height, stars.origin_px)
         use = sound_matches(stars, found, max(self.min_stars, ENOUGH_SOUND))
         if fisheye.is_wide(camera):
             use &= high_enough(directions_of(camera, stars)[found.star] @ up)
@@ -366,13 +355,13 @@ class Solver:
         up = found.attitude @ state.gcrs_to_itrs.T @ place.plumb_axes[2]
         sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
         check_risen(stars, found, camera, sky, up)
-        use, matched = self._matched(stars, found, camera, up, state, catalogue)
+        use, matched = self._matched(stars, found, up, state)
         about = self.circumstances(stars, camera.scaled(found.focal_scale), state)
         uncalibrated = fisheye.is_wide(camera) and not any(camera.distortion)
         if uncalibrated:
             about = replace(about, axis_stddev=max(about.axis_stddev, FISHEYE_AXIS))
         attitude = attitude_at_place(matched, place, about)
-        shown = attitude.hour_shown or self._hour_at_horizon(stars, found, camera, state, up)
+        shown = attitude.hour_shown or self._hour_at_horizon(stars, found, state, up)
         if not shown and self.hour_by_lens is not None:
             air = self.atmosphere
             shown = uncalibrated and self.hour_by_lens(stars, found, about.camera, catalogue, air, place)
@@ -381,9 +370,10 @@ class Solver:
         return replace(attitude, used=np.flatnonzero(use)[attitude.used], hour_shown=shown)
 
     def _hour_at_horizon(
-        self, stars: Stars, found: Identification, camera: Camera, state: EarthState, up: np.ndarray
+        self, stars: Stars, found: Identification, state: EarthState, up: np.ndarray
     ) -> bool:
         """Whether an hour more or less would put stars under the horizon; up (3,): the zenith in C."""
+        camera, _, _ = self.view(stars.width, stars.height, stars.origin_px)
         pole, every = found.attitude @ state.gcrs_to_itrs[2], directions_of(camera, stars)
         turned = (rotation.from_vector(sign * ROTATION_RAD_S * HOUR_S * pole) @ up for sign in (1, -1))
         return all(set_stars((every @ zenith)[found.star], every @ zenith) for zenith in turned)
@@ -443,14 +433,6 @@ class Solver:
                 "whether the lens is a fisheye (equidistant)"
             )
         return camera, deeper.for_field(self.catalogue, camera)
-
-    def _inside(self, stars: Stars) -> np.ndarray | None:
-        """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""
-        try:
-            return inside(stars, self.instrument.camera_for(stars.width, stars.height, stars.origin_px))
-        # who asks for the camera next reports the error
-        except InstrumentError:
-            return None
 
 
 def _refracted(

@@ -14,9 +14,9 @@ from starpos.earth.ellipsoid import ECCENTRICITY2
 from starpos.earth.orientation import EQUATOR_M_PER_S, ROTATION_RAD_S, SPEED_OF_LIGHT, later
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError
-from starpos.fix._adjustment import Adjustment
+from starpos.fix._adjustment import Adjustment, gain_of, spread
 from starpos.fix._scatter import distances2, expected_variance, sifted
-from starpos.fix.budget import Circumstances, StarErrors
+from starpos.fix.budget import Circumstances
 from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Stars
@@ -221,15 +221,36 @@ def sound_matches(stars: Stars, found: Identification, enough: int) -> np.ndarra
 @at_once
 @dataclass(frozen=True, kw_only=True)
 class StarFit:
-    """A fit of N stars: the problem, its solution, the errors of the M stars that are kept.
+    """A fit of N stars: the problem, its solution, and of the M stars that are kept their errors.
 
     residual (M, 2): fitted places minus seen places, px.
+    gain (3, M, 2): rotation of A4 in rad for an error of one pixel of each star.
+    centroids, catalogue (M, 2, 2): covariances in px2.
+    same_stars: keys of the stars; frames that share them share the errors of the catalogue.
     """
 
     problem: Adjustment
     fit: Fitted
-    errors: StarErrors
     residual: np.ndarray
+    gain: np.ndarray
+    centroids: np.ndarray
+    catalogue: np.ndarray
+    same_stars: tuple
+
+    @property
+    def own(self) -> np.ndarray:
+        """Covariance (3, 3) in rad2 of A4's rotation by the errors of the centroids."""
+        return self.rotation_covariance(self.centroids)
+
+    def rotated(self, errors_px: np.ndarray) -> np.ndarray:
+        """Rotation (3, ...) of A4 in rad that errors (M, 2, ...) of the predicted places in px make."""
+        # the gain is for errors of the seen places, which have the opposite sign
+        number = 2 * len(errors_px)
+        return -self.gain.reshape(3, number) @ errors_px.reshape(number, *errors_px.shape[2:])
+
+    def rotation_covariance(self, covariance: np.ndarray) -> np.ndarray:
+        """Covariance (3, 3) in rad2 of A4's rotation, from the covariances (M, 2, 2) in px2 of independent stars."""
+        return spread(self.gain, np.ascontiguousarray(covariance))
 
     @property
     def residual_px(self) -> float:
@@ -238,16 +259,16 @@ class StarFit:
 
     def terms(self, rows: np.ndarray, about: Circumstances) -> tuple[ErrorTerm, ...]:
         """The terms of the stars, the air and the shutter; rows (n, 3): the factors' rows for a small rotation of A4."""
-        errors, air = self.errors, about.atmosphere
+        air = about.atmosphere
 
         def of_stars(covariance: np.ndarray) -> np.ndarray:
-            return rows @ symmetric_root(errors.rotation_covariance(covariance))
+            return rows @ symmetric_root(self.rotation_covariance(covariance))
 
-        bent = errors.rotated(self._bent(air) * (air.relative_sigma / STEP_REFRACTION))
+        bent = self.rotated(self._bent(air) * (air.relative_sigma / STEP_REFRACTION))
         rolling = rows @ self._rolling(about.shutter, about.camera.height)
         return (
-            ErrorTerm("centroids", of_stars(errors.centroids)),
-            ErrorTerm("catalogue", of_stars(errors.catalogue), shared=errors.same_stars),
+            ErrorTerm("centroids", of_stars(self.centroids)),
+            ErrorTerm("catalogue", of_stars(self.catalogue), shared=self.same_stars),
             ErrorTerm("refraction", (rows @ bent)[:, None], shared=ALWAYS),
             ErrorTerm("shutter", rolling, shared=ALWAYS, constant_within_pose=True),
         )
@@ -267,7 +288,7 @@ class StarFit:
         """
         strength = self._bent(atmosphere)[..., None] / STEP_REFRACTION
         slope = np.concatenate([self.fit.slope[self.fit.kept], strength, moved], -1)
-        whole = self.errors.centroids + self.errors.catalogue
+        whole = self.centroids + self.catalogue
         weighted = np.linalg.solve(whole, slope)
         covariance = np.linalg.pinv(np.einsum("nki,nkj->ij", slope, weighted))
         found = covariance @ np.einsum("nki,nk->i", weighted, -self.residual)
@@ -292,7 +313,7 @@ class StarFit:
         # in a second the sky turns about the pole, which is a column of A4
         drift = fit.slope[fit.kept, :, :3] @ (-ROTATION_RAD_S * fit.a4[:, 2])
         late = shutter.errors_s(self.problem.xy[fit.kept, 1], height)
-        return self.errors.rotated(drift[..., None] * late[:, None])
+        return self.rotated(drift[..., None] * late[:, None])
 
 
 def fit_stars(
@@ -346,13 +367,23 @@ def _with_errors(
     claimed2 = expected_extra(residual, stated[kept], share_free(fit.keep))
     centroids = centroids_px2[kept] + ISOTROPIC * claimed2
     same_stars = ALWAYS if index is None else tuple(index[kept][:MARKS].tolist())
-    errors = StarErrors.of(fit.slope[kept], centroids, catalogue_px2[kept], same_stars)
-    if not np.isfinite(errors.gain).all() or not math.isfinite(claimed2):
+    gain = gain_of(
+        np.ascontiguousarray(fit.slope[kept]), np.ascontiguousarray(centroids + catalogue_px2[kept])
+    )
+    if not np.isfinite(gain).all() or not math.isfinite(claimed2):
         raise FixError(
             f"the {len(residual)} stars do not determine the attitude and its error: more stars are needed, "
             f"further apart, with realistic errors"
         )
-    return StarFit(problem=problem, fit=fit, errors=errors, residual=residual)
+    return StarFit(
+        problem=problem,
+        fit=fit,
+        residual=residual,
+        gain=gain,
+        centroids=centroids,
+        catalogue=catalogue_px2[kept],
+        same_stars=same_stars,
+    )
 
 
 def apparent(stars: MatchedStars, about: Circumstances) -> np.ndarray:

@@ -7,32 +7,31 @@ lamp, and makes the attitude better than by either. Without a place one frame gi
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
-from starpos.earth.orientation import EarthState, earth_state, station_velocity
+from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.place import Place, Places
-from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
+from starpos.earth.refraction import MIN_COS_ZENITH
 from starpos.errors import FixError, InstrumentError, PlaceError, StarposError
-from starpos.fix.attitude import ANY_TURN, CAMERA, ITRS, Attitude, CameraAttitude, heading_of
-from starpos.fix.budget import level_rows, local_north, mount_term, sky_rows, sky_terms, tilt_terms
+from starpos.fix.attitude import ANY_TURN, CameraAttitude
+from starpos.fix.budget import Circumstances, sky_terms, tilt_terms
 from starpos.fix.checks import MIN_DEG, check_unmoved
 from starpos.fix.circle import MIN_SINE, Circle, circle_along
-from starpos.fix.fix import Fix
+from starpos.fix.directions import axes_across
+from starpos.fix.fix import Fix, levelled_fix
 from starpos.fix.glows import Glow
 from starpos.fix.heading import AttitudeAtPlace, attitudes_at, zenith_moved
+from starpos.fix.sighting import seen_fields
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
 from starpos.frames.frame import Disc, Stars
-from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.sky.bodies import MOON, SUN, Body, body_at
@@ -53,34 +52,103 @@ RESOLVED_PX = 6.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """A disc as a direction: ray (3,) in C, its change (3, 2) by a px, and its radius, rad.
+class _Shot:
+    """A frame by day; about: its circumstances when the row of its disc was exposed, with the error of that time."""
 
-    own (3, 2), lens (3, 1): its errors in rad, new in each frame and of the lens.
+    solver: Solver
+    stars: Stars
+    about: Circumstances
+
+    @classmethod
+    def of(cls, solver: Solver, stars: Stars, disc: Disc, state: EarthState) -> "_Shot":
+        shutter, row = solver.shutter(stars), np.array([disc.y])
+        if late_s := float(shutter.later_s(row, stars.height)[0]):
+            state = earth_state(state.utc_unix_s + late_s)
+        camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
+        stamp_s = math.hypot(stars.stamp_stddev_s, *shutter.errors_s(row, stars.height)[0].tolist())
+        return cls(solver, stars, replace(solver.circumstances(stars, camera, state), stamp_stddev_s=stamp_s))
+
+    def look(self, disc: Disc, name: str) -> "_Look":
+        """The disc, or the bright point, as this body."""
+        x, y, r, camera = disc.x, disc.y, disc.radius_px, self.about.camera
+        rays = camera.directions(x + np.array([0, 1, 0, r, -r, 0, 0]), y + np.array([0, 0, 1, 0, 0, r, -r]))
+        ray = rays[0]
+        if not np.isfinite(rays).all():
+            raise FixError(
+                f"{self.stars.place}: the bright disc lies at the rim of the lens's picture: turn the camera"
+            )
+        slope = (rays[1:3] - ray).T
+        off_axis = np.array([x - camera.cx, y - camera.cy])
+        body = body_at(name, self.about.earth, self.solver.ephemeris)
+        if name not in BOTH:
+            # its light comes from a part of its disc
+            body = replace(body, sigma=math.hypot(body.sigma, body.radius))
+        return _Look(
+            shot=self,
+            disc=disc,
+            body=body,
+            ray=ray,
+            slope=slope,
+            own=slope @ symmetric_root(disc.covariance),
+            lens=slope @ off_axis[:, None] * LENS_SHARE,
+            radius=float(np.arccos(np.clip(rays[3:] @ ray, -1, 1)).mean()),
+        )
+
+    def looks(self, discs: Sequence[Disc], names: tuple[str, ...]) -> "list[_Look]":
+        """The discs as these bodies; PlaceError if one is of another size."""
+        found = [self.look(disc, name) for name, disc in zip(names, discs, strict=False)]
+        for look in found:
+            if look.body.name in BOTH:
+                # where the Moon stands as it must from a glow, that is no lamp
+                look.check_size(alone=names != BOTH)
+        return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Look:
+    """A disc as a direction, and the body that it is taken for.
+
+    ray (3,) in C, its change slope (3, 2) by a px, and the disc's radius, rad.
+    own (3, 2), lens (3, 1): errors of the ray in rad, new in each frame and of the lens.
     """
 
+    shot: _Shot
+    disc: Disc
+    body: Body
     ray: np.ndarray
     slope: np.ndarray
     own: np.ndarray
     lens: np.ndarray
     radius: float
 
-    @classmethod
-    def of(cls, disc: Disc, camera: Camera, place: str) -> "_Seen":
-        x, y, r = disc.x, disc.y, disc.radius_px
-        rays = camera.directions(x + np.array([0, 1, 0, r, -r, 0, 0]), y + np.array([0, 0, 1, 0, 0, r, -r]))
-        ray = rays[0]
-        if not np.isfinite(rays).all():
-            raise FixError(f"{place}: the bright disc lies at the rim of the lens's picture: turn the camera")
-        slope = (rays[1:3] - ray).T
-        off_axis = np.array([x - camera.cx, y - camera.cy])
-        return cls(
-            ray,
-            slope,
-            slope @ symmetric_root(disc.covariance),
-            slope @ off_axis[:, None] * LENS_SHARE,
-            float(np.arccos(np.clip(rays[3:] @ ray, -1, 1)).mean()),
+    def terms(self, across: np.ndarray, bent: np.ndarray) -> tuple[ErrorTerm, ...]:
+        """Errors of two components of the direction; across (2, 3): these in C.  bent (2,): by 1 sigma of refraction."""
+        return (
+            ErrorTerm("disc", across @ self.own),
+            ErrorTerm("lens", across @ self.lens, shared=ALWAYS),
+            ErrorTerm("ephemeris", np.eye(2) * self.body.sigma, shared=ALWAYS),
+            ErrorTerm("refraction", bent[:, None], shared=ALWAYS),
         )
+
+    def check_size(self, alone: bool = True) -> None:
+        """Raise PlaceError if the disc is not as wide as the body; alone: no second one shows that it is no lamp."""
+        disc, body, place = self.disc, self.body, self.shot.stars.place
+        if alone and not disc.sharp and body.radius * disc.radius_px > RESOLVED_PX * self.radius:
+            raise PlaceError(
+                f"{place}: a bright spot without a limb, in a lens that shows the Sun's: it is a lamp or a cloud, or the "
+                "Sun without a filter, behind which alone such a lens may look at it"
+            )
+        if disc.sharp:
+            off = abs(self.radius / body.radius - 1) > SIZE_SHARE + SIZE_PX / disc.radius_px
+        else:
+            off = not body.radius * (1 - SIZE_PX / disc.radius_px) < self.radius < WIDEST_GLOW
+        if off:
+            name = body.name.title()
+            raise PlaceError(
+                f"{place}: its bright disc is {math.degrees(2 * self.radius):.2f} deg wide and the {name} "
+                f"{math.degrees(2 * body.radius):.2f}: it is not the {name}, or the focal length "
+                f"({self.shot.about.camera.fx:.0f} px) is wrong"
+            )
 
 
 def sun_alone(solver: Solver, stars: Stars, disc: Disc, frame_id: str) -> CameraAttitude | None:
@@ -88,42 +156,24 @@ def sun_alone(solver: Solver, stars: Stars, disc: Disc, frame_id: str) -> Camera
     if stars.mid_unix_s is None:
         return None
     try:
-        state, camera, seen, stamp_s = _looked_at(solver, stars, disc, earth_state(stars.mid_unix_s))
-        body = body_at(SUN, state, solver.ephemeris)
-        _check_size(disc, seen, body, camera, stars.place)
+        look = _Shot.of(solver, stars, disc, earth_state(stars.mid_unix_s)).look(disc, SUN)
+        look.check_size()
     except StarposError:
         return None
-    if seen.ray[2] <= 0:
+    about, ray = look.shot.about, look.ray
+    if ray[2] <= 0:
         return None
-    own = np.column_stack([seen.own, seen.lens, np.eye(3) * body.sigma])
-    turns = np.cross(seen.ray, own.T)
+    own = np.column_stack([look.own, look.lens, np.eye(3) * look.body.sigma])
+    turns = np.cross(ray, own.T)
     return CameraAttitude(
-        utc_unix_s=state.utc_unix_s,
-        stamp_stddev_s=stamp_s,
-        clock_stddev_s=solver.clock_stddev_s(stars),
+        utc_unix_s=about.earth.utc_unix_s,
+        stamp_stddev_s=about.stamp_stddev_s,
+        clock_stddev_s=about.clock_stddev_s,
         frame_id=frame_id,
-        camera_to_gcrs=rotation.shortest_turn(seen.ray, state.gcrs_to_itrs.T @ body.itrs),
-        covariance=turns.T @ turns + ANY_TURN * np.outer(seen.ray, seen.ray),
+        camera_to_gcrs=rotation.shortest_turn(ray, about.earth.gcrs_to_itrs.T @ look.body.itrs),
+        covariance=turns.T @ turns + ANY_TURN * np.outer(ray, ray),
         stars=0,
         log_odds=0.0,
-    )
-
-
-def _looked_at(
-    solver: Solver, stars: Stars, disc: Disc, state: EarthState
-) -> tuple[EarthState, Camera, _Seen, float]:
-    """The state at the disc's row, the camera, the disc as a direction, and the error of its time, s."""
-    shutter = solver.shutter(stars)
-    row = np.array([disc.y])
-    if late_s := float(shutter.later_s(row, stars.height)[0]):
-        state = earth_state(state.utc_unix_s + late_s)
-    camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
-    seen = _Seen.of(disc, camera, stars.place)
-    return (
-        state,
-        camera,
-        seen,
-        math.hypot(stars.stamp_stddev_s, *shutter.errors_s(row, stars.height)[0].tolist()),
     )
 
 
@@ -145,30 +195,32 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
                 "known place, or state it"
             )
         state, tilt = solver.levelled(stars, tilts or NO_TILTS)
-        state, camera, seen, stamp_s = _looked_at(solver, stars, disc, state)
-        sun, moon = (body_at(name, state, solver.ephemeris).itrs for name in BOTH)
+        shot = _Shot.of(solver, stars, disc, state)
+        state, as_sun = shot.about.earth, shot.look(disc, SUN)
         if not disc.sharp:
-            sigma = float(np.linalg.norm(seen.own)) / math.sqrt(2)
-            glow = Glow(state.utc_unix_s, seen.ray, sun, sigma)
-        looked = partial(_looks, solver, stars, camera=camera, state=state)
-        apart = bool(np.linalg.norm(sun - moon) > NEAREST)
+            sigma = float(np.linalg.norm(as_sun.own)) / math.sqrt(2)
+            glow = Glow(state.utc_unix_s, as_sun.ray, as_sun.body.itrs, sigma)
+        moon = body_at(MOON, state, solver.ephemeris)
+        apart = bool(np.linalg.norm(as_sun.body.itrs - moon.itrs) > NEAREST)
         place = None if places is None else places.at(state.utc_unix_s)
-        both: tuple[str, ...] = BOTH if disc.other is not None and apart else ()
-        discs: tuple[Disc | None, ...] = disc, disc.other
-        if not both and disc.sharp:
-            both, discs = _with_planet(solver, stars, disc, looked, tilt, place, state, stamp_s)
+        both: tuple[str, ...] = ()
+        discs: tuple[Disc, ...] = (disc,)
+        if disc.other is not None and apart:
+            both, discs = BOTH, (disc, disc.other)
+        elif disc.sharp:
+            both, discs = _with_planet(shot, disc, tilt, place)
         if place is None:
             if both:
                 with suppress(PlaceError):
-                    fix = _two_body_fix(solver, stars, looked(discs, both), tilt, state, stamp_s)
+                    fix = _two_body_fix(shot.looks(discs, both), tilt)
                     return Solution.of(stars, f"fix by {_named(both)}", fix=fix, tilt=tilt, bodies=both)
-            return replace(_on_circle(solver, stars, disc, seen, tilt, state, stamp_s), glow=glow)
+            return replace(_on_circle(as_sun, tilt), glow=glow)
         wrong = []
         found: dict[tuple[str, ...], AttitudeAtPlace] = {}
         for names in itertools.chain((both,) * bool(both), ((SUN,), (MOON,))[: 1 + disc.sharp]):
             if both not in found:
                 try:
-                    found[names] = _attitude(solver, stars, looked(discs, names), tilt, state, place, stamp_s)
+                    found[names] = _attitude(shot.looks(discs, names), tilt, place)
                 except PlaceError as error:
                     wrong.append(error)
         if not found:
@@ -193,48 +245,6 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
 
 def _named(names: tuple[str, ...]) -> str:
     return " and ".join(f"the {name.title()}" for name in names)
-
-
-@dataclass(frozen=True, eq=False)
-class _Look:
-    """A disc as it is seen, and the body that it is taken for.  sharp: whether its limb was fitted."""
-
-    seen: _Seen
-    body: Body
-    sharp: bool
-
-    def terms(self, across: np.ndarray, bent: np.ndarray) -> tuple[ErrorTerm, ...]:
-        """Errors of two components of the direction; across (2, 3): these in C.  bent (2,): by 1 sigma of refraction."""
-        return (
-            ErrorTerm("disc", across @ self.seen.own),
-            ErrorTerm("lens", across @ self.seen.lens, shared=ALWAYS),
-            ErrorTerm("ephemeris", np.eye(2) * self.body.sigma, shared=ALWAYS),
-            ErrorTerm("refraction", bent[:, None], shared=ALWAYS),
-        )
-
-
-def _looks(
-    solver: Solver,
-    stars: Stars,
-    discs: Sequence[Disc | None],
-    names: tuple[str, ...],
-    *,
-    camera: Camera,
-    state: EarthState,
-) -> list[_Look]:
-    """The discs of a frame as these bodies; PlaceError if one is of another size."""
-    found = []
-    for name, one in zip(names, discs, strict=False):
-        assert one is not None
-        seen, body = _Seen.of(one, camera, stars.place), body_at(name, state, solver.ephemeris)
-        if name in BOTH:
-            # where the Moon stands as it must from a glow, that is no lamp
-            _check_size(one, seen, body, camera, stars.place, alone=names != BOTH)
-        else:
-            # its light comes from a part of its disc
-            body = replace(body, sigma=math.hypot(body.sigma, body.radius))
-        found.append(_Look(seen, body, one.sharp))
-    return found
 
 
 # A second body is where it must be to this many sigma.  So near the Sun, rad, the Moon is a crescent that is not seen: a
@@ -275,27 +285,28 @@ class _Between:
     sigma: float
 
     @classmethod
-    def of(cls, looks: list[_Look], g: np.ndarray, air: Atmosphere, frame: str) -> "_Between":
+    def of(cls, looks: list[_Look], g: np.ndarray) -> "_Between":
         """Fit both bodies; g (3, 3): C into the level's axes.  PlaceError for bodies too low."""
-        raised = np.array([g @ look.seen.ray for look in looks])
+        shot = looks[0].shot
+        raised = np.array([g @ look.ray for look in looks])
         if raised[:, 2].min() < MIN_COS_ZENITH:
-            raise PlaceError(f"{frame}: by the level one of its two bodies is below {MIN_DEG:.0f} deg")
-        there = air.refraction().unbend(raised)
-        bodies, seen = [look.body for look in looks], [look.seen for look in looks]
-        variances = np.array(
-            [np.sum(s.own**2) / 2 + np.sum(s.lens**2) + b.sigma**2 for s, b in zip(seen, bodies, strict=True)]
-        )
-        sky = np.array([b.itrs for b in bodies])
+            raise PlaceError(
+                f"{shot.stars.place}: by the level one of its two bodies is below {MIN_DEG:.0f} deg"
+            )
+        there = shot.about.atmosphere.refraction().unbend(raised)
+        variances = np.array([np.sum(k.own**2) / 2 + np.sum(k.lens**2) + k.body.sigma**2 for k in looks])
+        sky = np.array([look.body.itrs for look in looks])
         a4 = rotation.best_rotation(sky, there, 1 / variances)
         # the Moon's parallax follows the zenith, of which it is a sixtieth
         for _ in range(PARALLAX_ROUNDS):
-            sky = np.array([b.from_place(a4[2]) for b in bodies])
+            sky = np.array([look.body.from_place(a4[2]) for look in looks])
             a4 = rotation.best_rotation(sky, there, 1 / variances)
         # each direction's errors along the line to the other; the lens's have one cause
-        along = np.array([s.ray for s in seen[::-1]]) / np.linalg.norm(np.cross(seen[0].ray, seen[1].ray))
-        errors = [row @ s.own for row, s in zip(along, seen, strict=True)]
-        lens = sum(row @ s.lens for row, s in zip(along, seen, strict=True))
-        sigma = np.linalg.norm(np.concatenate([*errors, lens, [b.sigma for b in bodies]]))
+        rays = np.array([look.ray for look in looks])
+        along = rays[::-1] / np.linalg.norm(np.cross(*rays))
+        errors = [row @ look.own for row, look in zip(along, looks, strict=True)]
+        lens = sum(row @ look.lens for row, look in zip(along, looks, strict=True))
+        sigma = np.linalg.norm(np.concatenate([*errors, lens, [look.body.sigma for look in looks]]))
         return cls(raised=raised, there=there, sky=sky, variances=variances, a4=a4, sigma=float(sigma))
 
     @property
@@ -311,43 +322,35 @@ class _Between:
 
 
 def _with_planet(
-    solver: Solver,
-    stars: Stars,
-    disc: Disc,
-    looked: Callable[[Sequence[Disc | None], tuple[str, ...]], list[_Look]],
-    tilt: Tilt,
-    place: Place | None,
-    state: EarthState,
-    stamp_s: float,
+    shot: _Shot, disc: Disc, tilt: Tilt, place: Place | None
 ) -> tuple[tuple[str, ...], tuple[Disc, ...]]:
     """The disc's body and a planet, with the disc and the bright point that is one; nothing where it may be none.
 
     A point agrees by its distance from the disc, and at a known place by its altitude.  The chance that another one would
     counts every point as every planet, by the share of the frame's pixels that are as far and as high.
     """
+    stars, about = shot.stars, shot.about
     points = [
         Disc(x=x, y=y, covariance=covariance, radius_px=0.0, sharp=True)
         for x, y, covariance, _ in zip(stars.x, stars.y, stars.covariance, range(POINTS), strict=False)
     ]
-    camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
-    mounting = solver.instrument.mounting
-    level = mounting.level(tilt)
+    level = about.mounting.level(tilt)
     pixels = (np.arange(GRID) + 0.5) / GRID
     x, y = (part.ravel() for part in np.meshgrid(pixels * stars.width, pixels * stars.height))
-    rays = camera.directions(x, y)
+    rays = about.camera.directions(x, y)
     found, shares = [], 0.0
     for names, point in itertools.product(itertools.product(BOTH, BY_DAY), points):
         with suppress(PlaceError, FixError):
-            looks = looked((disc, point), names)
-            pair = _Between.of(looks, level.camera, solver.atmosphere, stars.place)
+            looks = shot.looks((disc, point), names)
+            pair = _Between.of(looks, level.camera)
             seen, true = pair.angles
-            near = np.abs(np.arccos(np.clip(rays @ looks[0].seen.ray, -1, 1)) - true) < BAND
+            near = np.abs(np.arccos(np.clip(rays @ looks[0].ray, -1, 1)) - true) < BAND
             off, sigma = np.array([seen - true]), np.array([pair.sigma])
             if place is not None:
-                sighted = _Sighted.of(solver, stars, looks[1], level.camera, place, state, stamp_s)
-                of_level = tilt_terms(sighted.turn[1:], level, tilt, mounting, state.utc_unix_s)
-                variance = total_covariance(sighted.terms)[1, 1] + total_covariance(of_level)[0, 0]
-                altitude = math.asin(sighted.bent[2])
+                planet = _Above.of(looks[1], level.camera, place)
+                of_level = tilt_terms(planet.turn[1:], level, tilt, about.mounting, about.earth.utc_unix_s)
+                variance = total_covariance(planet.terms)[1, 1] + total_covariance(of_level)[0, 0]
+                altitude = math.asin(planet.bent[2])
                 off = np.append(off, math.asin(pair.raised[1, 2]) - altitude)
                 sigma = np.append(sigma, variance**0.5)
                 near &= np.abs(np.arcsin(rays @ level.camera[2]) - altitude) < BAND
@@ -358,191 +361,108 @@ def _with_planet(
     return sound[0] if len(sound) == 1 else ((), (disc,))
 
 
-def _two_body_fix(
-    solver: Solver, stars: Stars, looks: list[_Look], tilt: Tilt, state: EarthState, stamp_s: float
-) -> Fix:
+def _two_body_fix(looks: list[_Look], tilt: Tilt) -> Fix:
     """Place and attitude by two bodies and the level; PlaceError if they are not as far apart as they must be."""
-    camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
-    about = solver.circumstances(stars, camera, state)
-    mounting, air = about.mounting, about.atmosphere
-    level = mounting.level(tilt)
+    shot = looks[0].shot
+    about, level = shot.about, shot.about.mounting.level(tilt)
     g = level.camera
-    pair = _Between.of(looks, g, air, stars.place)
+    pair = _Between.of(looks, g)
     raised, there, variances, a4 = pair.raised, pair.there, pair.variances, pair.a4
-    off = there - pair.sky @ a4.T
     if not pair.agree:
         seen_deg, true_deg = np.degrees(pair.angles)
         names = _named(tuple(k.body.name for k in looks))
         raise PlaceError(
-            f"{stars.place}: its two bright discs are {seen_deg:.2f} deg apart, and {names} {true_deg:.2f}"
+            f"{shot.stars.place}: its two bright discs are {seen_deg:.2f} deg apart, and {names} {true_deg:.2f}"
         )
-    across = [_across(v) for v in there]
+    across = axes_across(there)
     turned = [np.cross(v, c) for v, c in zip(there, across, strict=True)]
     spread = np.linalg.inv(sum(t.T @ t / v for t, v in zip(turned, variances, strict=True)))
     by = [spread @ t.T / v for t, v in zip(turned, variances, strict=True)]
-    place = local_north(a4)
-    link_to_enu = place.local_to_enu @ g @ mounting.link_to_camera
-    of_sky, of_level = sky_rows(place), level_rows(place, link_to_enu)
     of_bodies = [
-        k.terms(c @ g, c @ (seen - v) * air.relative_sigma)
+        k.terms(c @ g, c @ (seen - v) * about.atmosphere.relative_sigma)
         for k, c, v, seen in zip(looks, across, there, raised, strict=True)
     ]
-    terms = (
-        *_of_all([of_sky @ row for row in by], of_bodies),
-        *tilt_terms(of_level, level, tilt, mounting, state.utc_unix_s),
-        *sky_terms(of_sky, state, about.clock_stddev_s, stamp_s, a4),
-        *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
-    )
     own = total_covariance(_of_all(by, [terms[:1] for terms in of_bodies]))
-    axes = rotation.shortest_turn(np.array([0.0, 0.0, 1.0]), level.up)[:, :2]
-    fix = Fix(
-        **_fields(stars, state, tilt, about.clock_stddev_s, a4, g, own),
-        residual_arcsec=math.sqrt(float(np.mean(off**2))) / ARCSEC,
-        zenith_distance=math.acos(min(max(float(g[2] @ camera.centre_ray), -1.0), 1.0)),
-        refraction_arcsec=math.dist(raised[0], there[0]) / ARCSEC,
-        latitude=place.latitude,
-        longitude=place.longitude,
-        heading=heading_of(link_to_enu),
-        link_to_enu=link_to_enu,
-        terms=terms,
-        levelling=of_level @ (level.turns @ axes),
+    fix = levelled_fix(
+        seen_fields(about, g, a4, own)
+        | {"residual_arcsec": math.sqrt(float(np.mean((there - pair.sky @ a4.T) ** 2))) / ARCSEC},
+        a4,
+        level,
+        tilt,
+        about,
+        lambda rows: _of_all([rows @ row for row in by], of_bodies),
     )
-    check_unmoved(fix, solver.instrument)
+    check_unmoved(fix, shot.solver.instrument)
     return fix
 
 
-def _fields(
-    stars: Stars,
-    state: EarthState,
-    tilt: Tilt,
-    clock_s: float,
-    a4: np.ndarray,
-    g: np.ndarray,
-    own: np.ndarray,
-) -> dict[str, Any]:
-    """Fields of a FittedSighting without stars; g (3, 3): C into L, own (3, 3): covariance of the frame's own errors."""
-    return {
-        "utc_unix_s": state.utc_unix_s,
-        "camera": Attitude(a4.T @ g, a4.T @ own @ a4, of=CAMERA, into=ITRS),
-        "stamp_stddev_s": stars.stamp_stddev_s,
-        "clock_stddev_s": clock_s,
-        "tilt": tilt,
-        "used": np.zeros(0, int),
-        "residual_px": np.zeros((0, 2)),
-        "jitter_px": 0.0,
-        "focal_scale": 1.0,
-        "diurnal_aberration_arcsec": math.hypot(*station_velocity(a4[2])) / ARCSEC,
-        "ut1_minus_utc_s": state.orientation.ut1_minus_utc_s,
-    }
-
-
-def _across(direction: np.ndarray) -> np.ndarray:
-    """Unit vectors (2, 3) across a direction (3,): sideways and upwards."""
-    along = np.array([-direction[1], direction[0], 0.0]) / math.hypot(direction[0], direction[1])
-    return np.stack([along, np.cross(direction, along)])
-
-
-def _check_size(disc: Disc, seen: _Seen, body: Body, camera: Camera, place: str, alone: bool = True) -> None:
-    """Raise PlaceError if a disc is not as wide as the body."""
-    if alone and not disc.sharp and body.radius * disc.radius_px > RESOLVED_PX * seen.radius:
-        raise PlaceError(
-            f"{place}: a bright spot without a limb, in a lens that shows the Sun's: it is a lamp or a cloud, or the Sun "
-            "without a filter, behind which alone such a lens may look at it"
-        )
-    if disc.sharp:
-        off = abs(seen.radius / body.radius - 1) > SIZE_SHARE + SIZE_PX / disc.radius_px
-    else:
-        off = not body.radius * (1 - SIZE_PX / disc.radius_px) < seen.radius < WIDEST_GLOW
-    if off:
-        raise PlaceError(
-            f"{place}: its bright disc is {math.degrees(2 * seen.radius):.2f} deg wide and the {body.name.title()} "
-            f"{math.degrees(2 * body.radius):.2f}: it is not the {body.name.title()}, or the focal length "
-            f"({camera.fx:.0f} px) is wrong"
-        )
-
-
-def _on_circle(
-    solver: Solver, stars: Stars, disc: Disc, seen: _Seen, tilt: Tilt, state: EarthState, stamp_s: float
-) -> Solution:
+def _on_circle(as_sun: _Look, tilt: Tilt) -> Solution:
     """The Sun's circle of equal altitude, with the Moon's in its stead; a glow is not the Moon's."""
-    camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
-    up = solver.instrument.mounting.level(tilt).camera[2]
-    across = (up - (up @ seen.ray) * seen.ray) / max(math.sqrt(1 - (up @ seen.ray) ** 2), MIN_SINE)
-    lens = ErrorTerm("lens", (across @ seen.lens)[None], shared=ALWAYS)
-    about = replace(solver.circumstances(stars, camera, state), stamp_stddev_s=stamp_s)
+    shot, ray, disc = as_sun.shot, as_sun.ray, as_sun.disc
+    up = shot.about.mounting.level(tilt).camera[2]
+    across = (up - (up @ ray) * ray) / max(math.sqrt(1 - (up @ ray) ** 2), MIN_SINE)
+    lens = ErrorTerm("lens", (across @ as_sun.lens)[None], shared=ALWAYS)
 
-    def circle_of(name: str) -> Circle:
-        body = body_at(name, state, solver.ephemeris)
-        _check_size(disc, seen, body, camera, stars.place)
-        sigma = math.hypot(float(np.linalg.norm(across @ seen.own)), body.sigma)
+    def circle_of(look: _Look) -> Circle:
+        look.check_size()
+        body, sigma = look.body, math.hypot(float(np.linalg.norm(across @ look.own)), look.body.sigma)
         circle = circle_along(
-            seen.ray, body.itrs, stars.place, tilt, about, sigma=sigma, parallax=body.parallax
+            ray, body.itrs, shot.stars.place, tilt, shot.about, sigma=sigma, parallax=body.parallax
         )
         return replace(circle, terms=(*circle.terms, lens))
 
-    circle = circle_of(SUN)
+    circle = circle_of(as_sun)
     if disc.sharp:
         with suppress(PlaceError):
-            circle = replace(circle, instead=circle_of(MOON))
+            circle = replace(circle, instead=circle_of(shot.look(disc, MOON)))
     name = "the Sun" if circle.instead is None else "the Sun, or the Moon,"
     text = f"{name} {math.degrees(circle.zenith_distance):.4f} deg from the zenith"
-    return Solution.of(stars, text, circle=circle, tilt=tilt, bodies=(SUN,))
+    return Solution.of(shot.stars, text, circle=circle, tilt=tilt, bodies=(SUN,))
 
 
 # change of up's components, towards east and north, by a small rotation
 OF_UP = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
-def _attitude(
-    solver: Solver,
-    stars: Stars,
-    looks: list[_Look],
-    tilt: Tilt,
-    state: EarthState,
-    place: Place,
-    stamp_s: float,
-) -> AttitudeAtPlace:
+def _attitude(looks: list[_Look], tilt: Tilt, place: Place) -> AttitudeAtPlace:
     """The attitude by directions of bodies and the level, each in two components; PlaceError if they contradict."""
-    a4, air, mounting = place.plumb_axes, solver.atmosphere, solver.instrument.mounting
+    about, frame = looks[0].shot.about, looks[0].shot.stars.place
+    mounting = about.mounting
     level, moved = mounting.level(tilt), zenith_moved(place.plumb[0])
-    first = looks[0]
-    bent = _seen_from(first.body, air, a4, stars.place)[0]
-    local = level.camera @ first.seen.ray
-    if min(math.hypot(*bent[:2]), math.hypot(*local[:2])) < MIN_SINE:
+    first, local = _Above.of(looks[0], level.camera, place), level.camera @ looks[0].ray
+    if min(math.hypot(*first.bent[:2]), math.hypot(*local[:2])) < MIN_SINE:
         raise FixError(
-            f"{stars.place}: the {first.body.name.title()} is in the zenith, where it gives no heading"
+            f"{frame}: the {looks[0].body.name.title()} is in the zenith, where it gives no heading"
         )
-    # by the level and the first body's azimuth
-    g = rotation.about_axis(2, math.atan2(bent[1], bent[0]) - math.atan2(local[1], local[0])) @ level.camera
-    of_up = tilt_terms(OF_UP @ g @ level.camera.T, level, tilt, mounting, state.utc_unix_s)
+    found = g = first.g
+    of_up = tilt_terms(OF_UP @ g @ level.camera.T, level, tilt, mounting, about.earth.utc_unix_s)
     up = OF_UP.T @ np.linalg.inv(total_covariance(of_up))
-    normal, found = up @ OF_UP, g
+    normal = up @ OF_UP
     weighted: list[np.ndarray] = []
     of_bodies: list[tuple[ErrorTerm, ...]] = []
     off_px = []
     for look in looks:
-        sighted = _Sighted.of(solver, stars, look, g, place, state, stamp_s)
-        bent, components, turn, of_body = sighted.bent, sighted.components, sighted.turn, sighted.terms
-        whole = total_covariance(of_body)
-        off = components @ (bent - found @ look.seen.ray)
+        there = _Above.of(look, g, place)
+        turn, whole = there.turn, total_covariance(there.terms)
+        off = there.components @ (there.bent - found @ look.ray)
         # what is known already has no azimuth until there is a body
         known = turn @ np.linalg.pinv(normal) @ turn.T
         share = slice(None) if weighted else slice(1, 2)
         sigmas = math.sqrt(off[share] @ np.linalg.solve((whole + known)[share, share], off[share]))
-        if sigmas > (LIMB_SIGMAS if look.sharp else GLOW_SIGMAS):
-            name, seen = look.body.name.title(), found @ look.seen.ray
+        if sigmas > (LIMB_SIGMAS if look.disc.sharp else GLOW_SIGMAS):
+            name, seen = look.body.name.title(), found @ look.ray
             raise PlaceError(
-                f"{stars.place}: by the level its bright disc is at an altitude of {_altitude_deg(seen):.2f} deg, and "
-                f"the {name} at {_altitude_deg(bent):.2f}, {sigmas:.0f} times the stated errors away: it is not the "
+                f"{frame}: by the level its bright disc is at an altitude of {_altitude_deg(seen):.2f} deg, and the "
+                f"{name} at {_altitude_deg(there.bent):.2f}, {sigmas:.0f} times the stated errors away: it is not the "
                 f"{name}, or the clock, the place, the tilts or A3 are wrong"
             )
         weight = turn.T @ np.linalg.inv(whole)
         normal = normal + weight @ turn
         found = rotation.from_vector(np.linalg.solve(normal, weight @ off)) @ found
         weighted.append(weight)
-        of_bodies.append(of_body)
-        expected, slope = found.T @ bent, look.seen.slope
-        off_px.append(np.linalg.lstsq(slope, expected - look.seen.ray, rcond=None)[0])
+        of_bodies.append(there.terms)
+        expected = found.T @ there.bent
+        off_px.append(np.linalg.lstsq(look.slope, expected - look.ray, rcond=None)[0])
     spread = np.linalg.inv(normal)
     *of_sky, deflected = _of_all([spread @ weight for weight in weighted], of_bodies)
     terms = (*of_sky, *(replace(t, factor=spread @ up @ t.factor) for t in of_up))
@@ -550,71 +470,50 @@ def _attitude(
     ellipsoid = plumb + moved * (place.ellipsoid_stddev - place.plumb_stddev)
     own = total_covariance(t for t in terms if not t.common)
     return AttitudeAtPlace(
-        **_fields(stars, state, tilt, solver.clock_stddev_s(stars), a4, found, own)
-        | {"residual_px": np.array(off_px)},
-        residual_arcsec=math.dist(expected, looks[-1].seen.ray) / ARCSEC,
-        zenith_distance=math.acos(min(max(bent[2], -1.0), 1.0)),
-        refraction_arcsec=math.dist(bent, sighted.true) / ARCSEC,
+        **seen_fields(about, found, place.plumb_axes, own) | {"residual_px": np.array(off_px)},
+        residual_arcsec=math.dist(expected, looks[-1].ray) / ARCSEC,
         place=place,
         **attitudes_at(place, found, mounting, terms, (plumb, ellipsoid)),
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Sighted:
-    """A body over a known place, bent (3,) as it is seen and true (3,) without air, along east, north and up.
+class _Above:
+    """A body over a known place, bent (3,) as it is seen, along east, north and up.
 
     components (2, 3): across it, sideways and upwards; turn (2, 3): their change by a small rotation.
-    terms: errors of them.
+    terms: errors of them.  g (3, 3): C into east, north, up by the level and the body's azimuth.
     """
 
     bent: np.ndarray
-    true: np.ndarray
     components: np.ndarray
     turn: np.ndarray
     terms: tuple[ErrorTerm, ...]
+    g: np.ndarray
 
     @classmethod
-    def of(
-        cls,
-        solver: Solver,
-        stars: Stars,
-        look: _Look,
-        g: np.ndarray,
-        place: Place,
-        state: EarthState,
-        stamp_s: float,
-    ) -> "_Sighted":
-        """Return the body over its place; g (3, 3): C into axes whose third is up."""
-        a4, moved = place.plumb_axes, zenith_moved(place.plumb[0])
-        bent, raised, true = _seen_from(look.body, solver.atmosphere, a4, stars.place)
-        components, local = _across(bent), g @ look.seen.ray
+    def of(cls, look: _Look, g: np.ndarray, place: Place) -> "_Above":
+        """The body over its place; g (3, 3): C into axes whose third is up.  PlaceError below the horizon."""
+        shot, a4, moved = look.shot, place.plumb_axes, zenith_moved(place.plumb[0])
+        true = a4 @ look.body.from_place(a4[2])
+        if true[2] < LOWEST_SINE:
+            raise PlaceError(
+                f"{shot.stars.place}: at this time and place the {look.body.name.title()} is at an altitude of "
+                f"{_altitude_deg(true):.1f} deg, and a heading takes the whole disc above the horizon: the frame shows "
+                "something else, or the clock or the place is wrong"
+            )
+        about = shot.about
+        bent, raised = about.atmosphere.raised(true)
+        components, local = axes_across(bent[None])[0], g @ look.ray
         g = rotation.about_axis(2, math.atan2(bent[1], bent[0]) - math.atan2(local[1], local[0])) @ g
         turn = np.cross(bent, components)
         terms = (
             *look.terms(components @ g, np.array([0.0, raised])),
-            *sky_terms(turn, state, solver.clock_stddev_s(stars), stamp_s, a4),
+            *sky_terms(turn, about.earth, about.clock_stddev_s, about.stamp_stddev_s, a4),
             ErrorTerm("place", turn @ moved @ place.zenith_root, shared=ALWAYS),
             ErrorTerm("deflection", turn @ moved * place.plumb_stddev, shared=ALWAYS),
         )
-        return cls(bent, true, components, turn, terms)
-
-
-def _seen_from(
-    body: Body, air: Atmosphere, a4: np.ndarray, frame: str
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """A body's direction (3,) in the air over a place, the error of its altitude, and its direction without air.
-
-    PlaceError below the horizon.
-    """
-    true, name = a4 @ body.from_place(a4[2]), body.name.title()
-    if true[2] < LOWEST_SINE:
-        raise PlaceError(
-            f"{frame}: at this time and place the {name} is at an altitude of {_altitude_deg(true):.1f} deg, and a "
-            "heading takes the whole disc above the horizon: the frame shows something else, or the clock or the place "
-            "is wrong"
-        )
-    return *air.raised(true), true
+        return cls(bent, components, turn, terms, g)
 
 
 def _altitude_deg(direction: np.ndarray) -> float:

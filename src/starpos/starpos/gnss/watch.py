@@ -206,16 +206,18 @@ class GnssWatch:
     """
 
     def __init__(self, instrument: Instrument, vertical: Vertical, learned: Learned | None = None) -> None:
-        self.learned = learned
-        self.disagrees = False
-        self.vertical = vertical
-        self._instrument = instrument
-        self.is_learning = learned is None
-        self._held: deque[GnssFrame] = deque(maxlen=MAX_HELD)
+        self.vertical, self._instrument = vertical, instrument
         self._of_pose = 0
         self._pose: Fix | None = None
         self._new_pose = True
         self._readings: frozenset[float] = frozenset()
+        self._begin(learned)
+
+    def _begin(self, learned: Learned | None) -> None:
+        """Begin with what is known, None of another inclinometer."""
+        self.learned: Learned | None = learned
+        self.is_learning, self.disagrees = learned is None, False
+        self._held: deque[GnssFrame] = deque(maxlen=MAX_HELD)
         # the readings of a frame that would have been an alarm, before A3 was known
         self._suspicious: frozenset[float] | None = None
         self._onsets = OnsetFilters.empty(0)
@@ -230,7 +232,7 @@ class GnssWatch:
             self._pose, self._of_pose = sighting, 0
         if self.learned is not None and self.learned.axes != tilt.axes:
             # another inclinometer
-            self._forget()
+            self._begin(None)
         if self.learned is None:
             if self._instrument.calibration.unknown:
                 return
@@ -238,12 +240,6 @@ class GnssWatch:
             self.learned = prior(self._instrument, tilt, stddev, sighting.utc_unix_s)
             self.is_learning = not is_linear(self.learned, tilt)
         self._age(sighting)
-
-    def _forget(self) -> None:
-        self.learned, self.is_learning, self.disagrees = None, True, False
-        self._held.clear()
-        self._suspicious = None
-        self._onsets = OnsetFilters.empty(0)
 
     def _age(self, sighting: Fix) -> None:
         learned, tilt = self.learned, sighting.tilt

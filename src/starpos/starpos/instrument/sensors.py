@@ -7,17 +7,16 @@ straight line) is a uniform distribution: `limit`. A noise density becomes the n
 `rms`.  The figures are in data/sensors.csv.
 """
 
-import csv
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
-from importlib import resources
 from itertools import groupby
 from math import pi, radians, sqrt
 from types import MappingProxyType
 
 from starpos.errors import InstrumentError
 from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.tables import packaged
 from starpos.units import ARCSEC
 
 # Rad; an acceleration of 1 mg looks like a tilt of 1e-3.
@@ -54,9 +53,7 @@ BUILT_IN = "built_in_rad"
 @lru_cache(maxsize=1)
 def _rows() -> Mapping[str, Mapping[str, float]]:
     """The figures of each model, by their fields."""
-    text = resources.files(__package__).joinpath("data", "sensors.csv").read_text("utf-8")
-    rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
-    models = groupby(rows, lambda r: r["model"])
+    models = groupby(packaged("starpos.instrument", "sensors.csv"), lambda r: r["model"])
     return MappingProxyType({model: {r["field"]: _sigma(r) for r in of_model} for model, of_model in models})
 
 

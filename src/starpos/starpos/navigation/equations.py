@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from starpos.earth.gravity import SPIN, geodetic_place, gravity, gravity_gradient, zenith_at
 from starpos.earth.orientation import ROTATION_RAD_S
-from starpos.navigation.preintegration import ERRORS, Pieces, Sums
+from starpos.navigation.preintegration import ERRORS, Pieces, Sums, summed
 from starpos.navigation.records import ImuModel, VelocityLog
 from starpos.navigation.vessel import MotionLaw, Vessel
-from starpos.units import SIGMA_PER_MAD
 
 # Columns of a node: place m and velocity m/s in ITRS, attitude as a small rotation about ITRS's axes in rad, biases of
 # gyro and accelerometer. If a law of motion stands in for a velocity: also speed along the nose and drift in ITRS
@@ -37,9 +36,9 @@ class Motion:
 
     attitude (K, 3, 3): body into ITRS.  place, velocity (K, 3): ITRS, m and m/s over ground.
     gyro_bias, accel_bias (K, 3); speed (K,), drift (K, 3) of a law of motion.
-    camera_to_body (3, 3), and as it was believed to be, nominal.  gyro_matrix, accel_matrix
-    (3, 3): what readings are too large by, as shares.  log_scale, log_axes (3,): of measured velocities, as a share and
-    a small rotation.  lag_s, refraction: see the columns.
+    camera_to_body (3, 3).  gyro_matrix, accel_matrix (3, 3): what readings are too large by, as shares.
+    log_scale, log_axes (3,): of measured velocities, as a share and a small rotation.  lag_s, refraction: see the
+    columns.
     """
 
     utc_unix_s: np.ndarray
@@ -51,7 +50,6 @@ class Motion:
     speed: np.ndarray
     drift: np.ndarray
     camera_to_body: np.ndarray
-    nominal: np.ndarray
     gyro_matrix: np.ndarray
     accel_matrix: np.ndarray
     log_scale: float = 0.0
@@ -114,6 +112,13 @@ def arrived(motion: Motion, sums: Sums, span_s: np.ndarray) -> Motion:
         place=_turned(back, place),
         velocity=_turned(back, inertial - np.cross(SPIN, place)),
         attitude=back @ attitude @ sums.turn,
+    )
+
+
+def sums_of(pieces: Pieces, motion: Motion) -> Sums:
+    """Sums between the nodes of a motion, of readings that its errors are taken off."""
+    return summed(
+        pieces, motion.gyro_bias[:-1], motion.accel_bias[:-1], motion.gyro_matrix, motion.accel_matrix
     )
 
 
@@ -420,9 +425,9 @@ def prior_rows(motion: Motion, model: ImuModel, vessel: Vessel, law: MotionLaw |
         sigma[SPEED], value[SPEED] = law.speed_stddev, motion.speed[0]
         sigma[DRIFT], value[DRIFT] = law.drift_stddev, motion.drift[0]
     matrix = np.where(np.eye(3, dtype=bool), model.scale_stddev, model.axes_stddev).ravel()
-    nominal = Rotation.from_matrix(motion.nominal.T @ motion.camera_to_body).as_rotvec()
+    mount = Rotation.from_matrix(vessel.camera_to_body.T @ motion.camera_to_body).as_rotvec()
     for columns, spread, now in (
-        (MOUNT, vessel.mount_stddev, nominal),
+        (MOUNT, vessel.mount_stddev, mount),
         (GYRO_MATRIX, matrix, motion.gyro_matrix.ravel()),
         (ACCEL_MATRIX, matrix, motion.accel_matrix.ravel()),
         (LOG_SCALE, SCALE_STDDEV, motion.log_scale),
@@ -438,10 +443,6 @@ def prior_rows(motion: Motion, model: ImuModel, vessel: Vessel, law: MotionLaw |
     rows[-1, PLACE] = zenith_at(motion.place[0]) / vessel.height_stddev_m
     rows[-1, -1] = (vessel.height_m - float(height)) / vessel.height_stddev_m
     return rows
-
-
-# velocities farther off come from a slipping wheel or another mishap
-OUTLIER_SIGMA = 5.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -491,11 +492,9 @@ class Odometry:
         forward = np.einsum("kji,kj->ki", attitude, motion.velocity[k] + velocity - motion.drift[k])
         return self.velocity - (1 + motion.log_scale) * (forward + np.cross(motion.log_axes, forward))
 
-    def residuals(
-        self, motion: Motion, missed: np.ndarray, keep: np.ndarray, vibration: float, n: int
-    ) -> Residuals:
-        """Equations of the nodes near velocities to keep (N,); missed (N, 3): measured less predicted, m/s."""
-        weight = keep / self.sigma**2
+    def residuals(self, motion: Motion, sums: Sums, pieces: Pieces, vibration: float, n: int) -> Residuals:
+        """Equations of the nodes near velocities."""
+        missed, weight = self.missed(motion, sums, pieces), self.sigma**-2
         total = np.bincount(self.node, weight, len(motion))
         index = np.flatnonzero(total)
         mean = np.stack([np.bincount(self.node, weight * part, len(motion)) for part in missed.T], -1)[index]
@@ -513,9 +512,3 @@ class Odometry:
         constants[:, :, LOG_AXES] = -crosses(forward)
         rows[:, :, -1] = mean / total[index, None]
         return Residuals(index=index, rows=rows, covariance=(sigma**2)[:, None, None] * np.eye(3))
-
-    def sound(self, missed: np.ndarray) -> np.ndarray:
-        """Mask (N,) of the velocities that do not lie beyond what most of them scatter, or should."""
-        size = np.abs(missed).max(1) / self.sigma
-        usual = max(1.0, SIGMA_PER_MAD * float(np.median(np.abs(missed) / self.sigma[:, None])))
-        return size < OUTLIER_SIGMA * usual

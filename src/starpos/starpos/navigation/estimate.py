@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is known at one time of a voyage: its fix, how later readings carry it on, and what would improve it."""
 
-from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,8 +27,9 @@ from starpos.navigation.equations import (
     Motion,
     arrived,
     links_of,
+    sums_of,
 )
-from starpos.navigation.preintegration import Pieces, Sums, summed
+from starpos.navigation.preintegration import Pieces
 from starpos.navigation.records import ImuLog, ImuModel
 from starpos.navigation.start import nodes_of
 from starpos.navigation.vessel import MotionLaw
@@ -99,7 +99,6 @@ def fix_of(
 
 # the equations of a link hold for so long
 LONGEST_S = 1.5
-T = TypeVar("T", Pieces, Sums)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -132,34 +131,23 @@ class Estimate:
 
     def carried_on(self, imu: ImuLog, until_s: float) -> "Estimate":
         """The estimate at a time after its own, by the readings until then; what is missing of them widens it."""
-        nodes = nodes_of(np.array([self.utc_unix_s, until_s]), LONGEST_S)
-        pieces = Pieces.cut(imu, nodes)
-        motion, covariance = self.motion, self.covariance
-        count = len(nodes) - 1
-        gyro_bias, accel_bias = (np.tile(b, (count, 1)) for b in (motion.gyro_bias, motion.accel_bias))
-        sums = summed(pieces, gyro_bias, accel_bias, motion.gyro_matrix, motion.accel_matrix)
-        for k in range(count):
-            motion, covariance = self._next(motion, covariance, _part(sums, k), _part(pieces, k))
-        return replace(self, motion=motion, covariance=covariance)
+        there = self
+        for time_s in nodes_of(np.array([self.utc_unix_s, until_s]), LONGEST_S)[1:]:
+            there = there._next(imu, time_s)
+        return there
 
-    def _next(
-        self, here: Motion, covariance: np.ndarray, sums: Sums, pieces: Pieces
-    ) -> tuple[Motion, np.ndarray]:
-        both = here.part(np.zeros(2, int))
-        both.utc_unix_s[1:] += pieces.span_s
+    def _next(self, imu: ImuLog, time_s: float) -> "Estimate":
+        both = self.motion.part(np.zeros(2, int))
+        both.utc_unix_s[1] = time_s
+        pieces = Pieces.cut(imu, both.utc_unix_s)
+        sums = sums_of(pieces, both)
         links = links_of(both, sums, pieces, self.model, self.law)
-        n = links.rows.shape[1]
-        onward = np.eye(len(covariance))
+        n = self.unknowns
+        onward = np.eye(len(self.covariance))
         onward[:n, :n], onward[:n, n:] = -links.rows[0, :, :n], -links.rows[0, :, 2 * n : -1]
-        there = arrived(both, sums, pieces.span_s)
-        after = onward @ covariance @ onward.T
+        after = onward @ self.covariance @ onward.T
         after[:n, :n] += links.covariance[0]
-        return there, after
-
-
-def _part(table: T, k: int) -> T:
-    """Interval k alone."""
-    return type(table)(**{f.name: getattr(table, f.name)[k : k + 1] for f in fields(table)})
+        return replace(self, motion=arrived(both, sums, pieces.span_s), covariance=after)
 
 
 # a claim of less needs no advice, m an axis

@@ -212,7 +212,8 @@ def borne_out(law: MotionLaw, motion: Motion) -> MotionLaw:
     side, across = _sideways(motion)
     latitude, longitude, _ = (float(x) for x in geodetic_place(motion.place[len(motion) // 2]))
     means = independent_means(t, side @ enu_axes(latitude, longitude)[:2].T, across, number)
-    rest, trend = law.rest_at(float(np.median(np.diff(t)))), law.drift_walk / t[-1] ** 0.5
+    rest = law.rest_stddev * law.longer(float(np.median(np.diff(t))))
+    trend = law.drift_walk / t[-1] ** 0.5
     white = (WALKS[:, None, None] * law.drift_walk) ** 2 * means.walks + (RESTS[:, None] * rest) ** 2
     likely = np.stack([means.log_likelihood(white, trend * size) for size in TRENDS])
     likely += np.log(PROBABLE)[:, None, None] - (np.log(WALKS)[:, None] ** 2 + np.log(RESTS) ** 2) / 2

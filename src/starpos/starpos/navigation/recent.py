@@ -3,8 +3,7 @@
 
 from bisect import bisect_left, insort
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -90,45 +89,34 @@ class RecentReadings:
         """Time of the last reading of the last block."""
         return float(self._blocks[-1][0][-1, 0])
 
+    @property
+    def first_s(self) -> float:
+        """Time of the first reading of the first block."""
+        return float(self._blocks[0][0][0, 0])
+
     def blocks(self) -> list[np.ndarray]:
         """Rows (N, 7) as they came."""
         return [block for block, _ in self._blocks]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RecentRecord:
-    """What a job adjusts: blocks of readings (N, 7), frames, and rows of velocities (N, 5), None without any."""
-
-    blocks: Sequence[np.ndarray]
-    frames: Sequence[FrameUnderWay]
-    velocity: np.ndarray | None
-
-    def adjusted(self, vessel: Vessel) -> Voyage:
-        """The voyage; VoyageError or FixError if it cannot be found."""
-        rows = np.concatenate(self.blocks)
-        imu = thinned(ImuLog.of(rows[:, 0], rows[:, 1:4], rows[:, 4:]), READING_S)
-        log = None
-        if self.velocity is not None:
-            t, velocity, sigma = self.velocity[:, 0], self.velocity[:, 1:4], self.velocity[:, 4]
-            log = VelocityLog(utc_unix_s=t, velocity=velocity, sigma=sigma)
-        return adjust_voyage(self.frames, imu, log, vessel)
-
-
 class Recent:
-    """Collects what comes and forgets what is older than a window."""
+    """Collects what comes and forgets what is older than a window.
+
+    frames: in the order of time.  velocities: utc_unix_s, three of m/s, and their sigma.
+    """
 
     def __init__(self) -> None:
         self.readings = RecentReadings()
-        self._frames: list[FrameUnderWay] = []
-        self._velocities: deque[tuple[float, ...]] = deque()
+        self.frames: list[FrameUnderWay] = []
+        self.velocities: deque[tuple[float, ...]] = deque()
 
     def add_frame(self, frame: FrameUnderWay) -> None:
         """Take a frame, whenever it comes; VoyageError for a second one of its time."""
-        k = bisect_left(self._frames, frame.utc_unix_s, key=_time)
-        if k < len(self._frames) and self._frames[k].utc_unix_s == frame.utc_unix_s:
+        k = bisect_left(self.frames, frame.utc_unix_s, key=_time)
+        if k < len(self.frames) and self.frames[k].utc_unix_s == frame.utc_unix_s:
             raise VoyageError("two attitudes have one stamp: the second one is left out")
-        insort(self._frames, frame, key=_time)
-        del self._frames[:-MAX_FRAMES]
+        insort(self.frames, frame, key=_time)
+        del self.frames[:-MAX_FRAMES]
 
     def add_velocity(self, utc_unix_s: float, velocity: Sequence[float], sigma: float) -> None:
         """Take a velocity in m/s along the body's axes; VoyageError in a sentence if it cannot be used."""
@@ -141,38 +129,36 @@ class Recent:
                 f"a velocity's sigma is {sigma:g} m/s, not between {MIN_SIGMA:g} and {MAX_SIGMA:g}: "
                 f"state each axis's sigma, or zeros for velocity_stddev"
             )
-        if self._velocities and utc_unix_s <= self._velocities[-1][0]:
+        if self.velocities and utc_unix_s <= self.velocities[-1][0]:
             raise VoyageError("a velocity is not later than the one before: it is left out")
-        self._velocities.append((utc_unix_s, *velocity, sigma))
+        self.velocities.append((utc_unix_s, *velocity, sigma))
 
     def forget(self, before_s: float) -> None:
         """Leave out what is older."""
         self.readings.forget(before_s)
-        del self._frames[: bisect_left(self._frames, before_s, key=_time)]
-        while self._velocities and self._velocities[0][0] < before_s:
-            self._velocities.popleft()
+        del self.frames[: bisect_left(self.frames, before_s, key=_time)]
+        while self.velocities and self.velocities[0][0] < before_s:
+            self.velocities.popleft()
 
     @property
     def newest_frame_s(self) -> float:
         """Time of the newest frame that readings have come up to; -inf without one."""
-        k = bisect_left(self._frames, self.readings.last_s, key=_time)
-        return self._frames[k - 1].utc_unix_s if k else -np.inf
+        k = bisect_left(self.frames, self.readings.last_s, key=_time)
+        return self.frames[k - 1].utc_unix_s if k else -np.inf
 
-    @property
-    def frames(self) -> int:
-        return len(self._frames)
+    def job(self, vessel: Vessel) -> Callable[[], Voyage]:
+        """What adjusts all of it as it is now; it raises VoyageError or FixError where there is no voyage."""
+        blocks, frames, velocities = self.readings.blocks(), tuple(self.frames), np.array(self.velocities)
 
-    @property
-    def velocities(self) -> int:
-        return len(self._velocities)
+        def adjusted() -> Voyage:
+            rows, log = np.concatenate(blocks), None
+            imu = thinned(ImuLog.of(rows[:, 0], rows[:, 1:4], rows[:, 4:]), READING_S)
+            if len(velocities):
+                t, velocity, sigma = velocities[:, 0], velocities[:, 1:4], velocities[:, 4]
+                log = VelocityLog(utc_unix_s=t, velocity=velocity, sigma=sigma)
+            return adjust_voyage(frames, imu, log, vessel)
 
-    def record(self) -> RecentRecord:
-        """All of it, for a job."""
-        return RecentRecord(
-            blocks=self.readings.blocks(),
-            frames=tuple(self._frames),
-            velocity=np.array(self._velocities) if self._velocities else None,
-        )
+        return adjusted
 
 
 def _time(frame: FrameUnderWay) -> float:

@@ -12,17 +12,16 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S, earth_orientation, earth_state, station_velocity
 from starpos.earth.place import Place
-from starpos.earth.refraction import Atmosphere, Refraction
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
 from starpos.fix.attitude import CAMERA, ENU, GCRS, ITRS, LINK, Attitude, CameraAttitude
 from starpos.fix.heading import zenith_moved
 from starpos.fix.sighting import Sighting
 from starpos.fix.solution import Solution
-from starpos.fix.star_fit import MatchedStars, StarFit, fit_seen, seen_problem, sound_matches
+from starpos.fix.star_fit import MatchedStars, fit_seen, sound_matches
 from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
-from starpos.frozen import at_once
 from starpos.identification import fisheye
 from starpos.instrument.camera import Camera
 from starpos.navigation.vessel import Vessel
@@ -31,7 +30,6 @@ from starpos.units import ARCSEC
 
 # of an attitude without refraction; 1 sigma
 ROUGH = 20 * ARCSEC
-STEP_REFRACTION = 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,111 +37,13 @@ class FrameUnderWay(Sighting, ABC):
     """A sighting whose attitude is computed again under each zenith that is tried."""
 
     def rough(self) -> Attitude:
-        """The attitude as it is without a place."""
-        return roughly(self.camera.rotation)
+        """The attitude as it is without a place, good to ROUGH."""
+        error = np.eye(3) * ROUGH**2
+        return Attitude(self.camera.rotation, error, of=CAMERA, into=ITRS, by_refraction=np.zeros(3))
 
     @abstractmethod
     def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
-        """The attitude under a zenith (3,) in ITRS; FixError where it has none."""
-
-
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class IdentifiedFrame(FrameUnderWay):
-    """N identified stars of a frame; `camera` is without refraction, good to ROUGH rad.
-
-    xy (N, 2), covariance_px2 (N, 2, 2): px, on a frame of the camera `optics`.
-    itrs (N, 3): geocentric apparent directions in ITRS.
-    """
-
-    xy: np.ndarray
-    covariance_px2: np.ndarray
-    itrs: np.ndarray
-    optics: Camera
-
-    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
-        """The attitude under a zenith (3,) in ITRS, with the plate scale, by the stars; FixError if they disagree."""
-        seen = self._fitted(_seen(self, zenith, atmosphere.refraction()))
-        stronger = _seen(self, zenith, atmosphere.refraction(1 + STEP_REFRACTION))
-        fit = seen.fit
-        there = seen_problem(self.xy, self.optics, stronger).predict(fit.a4, fit.scale)
-        shift = (there - self.xy - fit.residual)[fit.kept] / STEP_REFRACTION
-        # the camera turns the other way than the sky in it
-        return _camera_of(seen, -seen.errors.rotated(shift))
-
-    def placeless(self) -> Attitude:
-        """Fit attitude and plate scale where no zenith is known: refraction and diurnal aberration stay in it."""
-        return _camera_of(self._fitted(self.itrs), np.zeros(3))
-
-    def _fitted(self, seen: np.ndarray) -> StarFit:
-        """The fit to the directions seen (N, 3); FixError if the stars disagree."""
-        try:
-            return fit_seen(self.xy, self.covariance_px2, self.optics, seen)
-        except FixError as error:
-            raise FixError(f"{self.source}: {error}: left out") from None
-
-
-def _camera_of(seen: StarFit, by_refraction: np.ndarray) -> Attitude:
-    """The camera's attitude by a fit; by_refraction (3,): about C's axes."""
-    own = Attitude(
-        np.eye(3),
-        seen.errors.rotation_covariance(seen.errors.centroids),
-        of=CAMERA,
-        into=CAMERA,
-        by_refraction=by_refraction,
-    )
-    return own.then(seen.fit.a4.T, ITRS)
-
-
-def roughly(camera_to_itrs: np.ndarray) -> Attitude:
-    """An attitude (3, 3) that is good to ROUGH."""
-    error = np.eye(3) * ROUGH**2
-    return Attitude(camera_to_itrs, error, of=CAMERA, into=ITRS, by_refraction=np.zeros(3))
-
-
-def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> IdentifiedFrame:
-    """The frame under way of stars that are identified; a StarposError says why it cannot be used.
-
-    answer: of these stars, by the solver's camera.
-    """
-    mid_unix_s = stars.mid_unix_s
-    if mid_unix_s is None:
-        raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
-    camera, catalogue, _ = eye.view(stars.width, stars.height, stars.origin_px)
-    if fisheye.is_wide(camera):
-        raise InstrumentError(
-            f"{stars.place}: frames of a fisheye give no position under way: use a narrower lens"
-        )
-    if answer.found is None:
-        raise FrameError(answer.message)
-    if answer.warnings:
-        raise FrameError(
-            f"{stars.place}: its stars do not belong to one sky ({', '.join(answer.warnings)}): left out"
-        )
-    if answer.found.mirrored:
-        raise InstrumentError(f"{stars.place}: the frame is mirrored (its rows run bottom-up): flip it")
-    found, state = answer.found, earth_state(mid_unix_s)
-    use = sound_matches(stars, found, solver.ENOUGH_SOUND)
-    places = catalogue.directions(found.catalogue[use], state.year, state.observer_au)
-    matched = MatchedStars.of(stars, found, use, camera, catalogue, state.year, places)
-    catalogue_px2 = np.square(matched.place_sigma * camera.fx)[:, None, None]
-    return IdentifiedFrame(
-        utc_unix_s=mid_unix_s,
-        stamp_stddev_s=stars.stamp_stddev_s,
-        source=stars.place,
-        xy=matched.xy,
-        covariance_px2=matched.covariance_px2 + np.eye(2) * catalogue_px2,
-        itrs=state.to_itrs(places),
-        optics=camera.scaled(found.focal_scale),
-        camera=roughly(state.gcrs_to_itrs @ found.attitude.T),
-    )
-
-
-def _seen(sighting: IdentifiedFrame, zenith: np.ndarray, refraction: Refraction) -> np.ndarray:
-    """Directions (N, 3) along ITRS's axes in which the stars are seen under a zenith."""
-    level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
-    apparent = rotation.normalised(sighting.itrs + station_velocity(zenith))
-    return refraction.bend(apparent @ level.T) @ level
+        """The attitude under a zenith (3,) in ITRS."""
 
 
 # Refraction squeezes a frame more along the vertical than across. This turns the attitude across the axis if the middle
@@ -156,7 +56,7 @@ CIRCLE = np.array([[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4])
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlacelessFrame(FrameUnderWay):
-    """An attitude without refraction and diurnal aberration, as CameraAttitude has it."""
+    """An attitude by stars, which refraction and diurnal aberration have turned, as CameraAttitude has it."""
 
     @classmethod
     def of(cls, attitude: CameraAttitude) -> "PlacelessFrame":
@@ -191,6 +91,56 @@ class PlacelessFrame(FrameUnderWay):
         uneven = squeezed * np.array([OFF_AXIS, OFF_AXIS, SPREAD])
         whole = covariance + np.diag(uneven**2)
         return Attitude(camera, camera @ whole @ camera.T, of=CAMERA, into=ITRS, by_refraction=raised)
+
+
+def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> PlacelessFrame:
+    """The frame under way of stars that are identified; a StarposError says why it cannot be used.
+
+    answer: of these stars, by the solver's camera.
+    """
+    mid_unix_s = stars.mid_unix_s
+    if mid_unix_s is None:
+        raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
+    camera, catalogue, _ = eye.view(stars.width, stars.height, stars.origin_px)
+    if fisheye.is_wide(camera):
+        raise InstrumentError(
+            f"{stars.place}: frames of a fisheye give no position under way: use a narrower lens"
+        )
+    if answer.found is None:
+        raise FrameError(answer.message)
+    if answer.warnings:
+        raise FrameError(
+            f"{stars.place}: its stars do not belong to one sky ({', '.join(answer.warnings)}): left out"
+        )
+    if answer.found.mirrored:
+        raise InstrumentError(f"{stars.place}: the frame is mirrored (its rows run bottom-up): flip it")
+    found, state = answer.found, earth_state(mid_unix_s)
+    use = sound_matches(stars, found, solver.ENOUGH_SOUND)
+    places = catalogue.directions(found.catalogue[use], state.year, state.observer_au)
+    matched = MatchedStars.of(stars, found, use, camera, catalogue, state.year, places)
+    catalogue_px2 = np.square(matched.place_sigma * camera.fx)[:, None, None]
+    try:
+        attitude = placeless(
+            matched.xy,
+            matched.covariance_px2 + np.eye(2) * catalogue_px2,
+            camera.scaled(found.focal_scale),
+            state.to_itrs(places),
+        )
+    except FixError as error:
+        raise FixError(f"{stars.place}: {error}: left out") from None
+    return PlacelessFrame(
+        utc_unix_s=mid_unix_s, stamp_stddev_s=stars.stamp_stddev_s, source=stars.place, camera=attitude
+    )
+
+
+def placeless(xy: np.ndarray, covariance_px2: np.ndarray, optics: Camera, itrs: np.ndarray) -> Attitude:
+    """Fit attitude and plate scale where no zenith is known: refraction and diurnal aberration stay in it.
+
+    xy (N, 2), covariance_px2 (N, 2, 2): stars on a frame of a camera, px.  itrs (N, 3): geocentric apparent directions.
+    FixError if the stars disagree.
+    """
+    seen = fit_seen(xy, covariance_px2, optics, itrs)
+    return Attitude(np.eye(3), seen.own, of=CAMERA, into=CAMERA).then(seen.fit.a4.T, ITRS)
 
 
 # how far a direction that is said to be the Sun's may be from it, rad

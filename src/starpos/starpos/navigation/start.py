@@ -243,7 +243,6 @@ def first_motion(
         speed=np.zeros(count),
         drift=np.zeros((count, 3)),
         camera_to_body=camera_to_body,
-        nominal=camera_to_body,
         gyro_matrix=np.zeros((3, 3)),
         accel_matrix=np.zeros((3, 3)),
         log_axes=np.zeros(3),

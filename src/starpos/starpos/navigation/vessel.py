@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is known of instrument and vehicle before a voyage, with the laws of motion where nothing measures the speed."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
 from starpos.navigation.records import ImuModel
+from starpos.tables import packaged
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,38 +28,24 @@ class MotionLaw:
     climb_stddev: float
     rest_s: float
 
-    def rest_at(self, apart_s: float) -> float:
-        """The rest at times so far apart, m/s: as white noise that in the long run scatters as what keeps its sign."""
-        return self.rest_stddev * self.longer(apart_s)
-
     def longer(self, apart_s: float) -> float:
-        """Factor on the rest, or on climbing, at times so far apart."""
+        """Factor on the rest, or on climbing, at times so far apart, where it is taken for white noise.
+
+        In the long run that scatters as what keeps its sign.
+        """
         return max(1.0, 2 * self.rest_s / apart_s) ** 0.5
 
 
-def _law(*row: float) -> MotionLaw:
-    """The law with the fields of a row, in their order."""
-    return MotionLaw(**{f.name: value for f, value in zip(fields(MotionLaw), row, strict=True)})
-
-
 LAWS = {
-    name: _law(*row)
-    for name, row in {
-        # a path at a walk, that turns and stops as it likes
-        "rover": (2.0, 0.3, 0.01, 1e-4, 0.1, 0.2, 3.0),
-        # under way, in waves of seconds, in a current that is steady over an hour
-        "ship": (10.0, 0.05, 1.0, 0.003, 0.7, 0.7, 3.0),
-        # a steady airspeed in a wind that changes by 0.3 m/s in ten minutes; gusts of seconds
-        "drone": (50.0, 0.1, 15.0, 0.012, 0.8, 0.8, 4.0),
-        "parked": (1e-3, 1e-6, 1e-3, 1e-6, 2e-3, 2e-3, 1.0),
-    }.items()
+    row.pop("vehicle"): MotionLaw(**{name: float(value) for name, value in row.items()})
+    for row in packaged("starpos.navigation", "laws.csv")
 }
-# default: any vehicle on land, at sea or in the air
-ANYTHING = _law(100.0, 1.0, 30.0, 0.3, 5.0, 3.0, 10.0)
+ANYTHING = LAWS.pop("anything")
 # of a drift such a share changes in an hour
 DRIFT_CHANGE, DRIFT_CHANGE_S = 0.5, 3600.0
 
 
+# stands all the time; may stand on the ground now and then
 PARKED, ROVER = "parked", "rover"
 
 
@@ -91,14 +78,4 @@ class Vessel:
     def carried(self) -> MotionLaw:
         """How the drift changes where velocities are measured against water or air."""
         walk = DRIFT_CHANGE * self.drift_stddev / DRIFT_CHANGE_S**0.5
-        return _law(1e-3, 1e-6, self.drift_stddev, walk, 1e-3, 1e-3, 1.0)
-
-    @property
-    def parked(self) -> bool:
-        """Whether it stands all the time."""
-        return self.vehicle == PARKED
-
-    @property
-    def halts(self) -> bool:
-        """Whether it may stand on the ground now and then."""
-        return self.vehicle == ROVER
+        return replace(LAWS[PARKED], drift_stddev=self.drift_stddev, drift_walk=walk)

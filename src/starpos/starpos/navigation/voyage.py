@@ -32,6 +32,7 @@ from starpos.navigation.equations import (
     prior_rows,
     standing_residuals,
     star_residuals,
+    sums_of,
 )
 from starpos.navigation.estimate import Estimate, VoyageFix, fix_of
 from starpos.navigation.evidence import (
@@ -44,11 +45,11 @@ from starpos.navigation.evidence import (
     noise_density2,
     standstills,
 )
-from starpos.navigation.preintegration import Pieces, Sums, summed
+from starpos.navigation.preintegration import Pieces, summed
 from starpos.navigation.records import ImuLog, VelocityLog
 from starpos.navigation.sightings import FrameUnderWay, SunFrame
 from starpos.navigation.start import first_motion, nodes_of
-from starpos.navigation.vessel import MotionLaw, Vessel
+from starpos.navigation.vessel import PARKED, ROVER, MotionLaw, Vessel
 from starpos.progress import Progress, quiet
 from starpos.rotation import normalised
 from starpos.units import ARCSEC
@@ -111,26 +112,26 @@ class Adjustment:
         # how many times as much wind or current change as their law says
         self.weighings, self.more_drift = 0, 1.0
         self.noise_weighed = False
-        # nodes whose measurement of a kind is wrong, and velocities that are
+        # nodes whose measurement of a kind is wrong
         self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in self.excess}
         self.strays = 0
-        # frames whose own stars do not agree
-        self.unsound = 0
         # where it stands, None before it is looked for; and whether the rest of the record contradicts that it does
-        self.standing: Standstills | None = None if self.odometry is None and vessel.halts else NOWHERE
+        self.standing: Standstills | None = (
+            None if self.odometry is None and vessel.vehicle == ROVER else NOWHERE
+        )
         self.contradicted = False
-        self.slipped = np.zeros(0 if self.odometry is None else len(self.odometry.node), bool)
 
     def _law(self, vessel: Vessel) -> MotionLaw | None:
         if self.odometry is not None:
             return vessel.carried if vessel.drift_stddev > 0 else None
-        return None if vessel.parked else vessel.law
+        return None if vessel.vehicle == PARKED else vessel.law
 
     @property
     def left_out(self) -> dict[str, int]:
         """How many measurements of each kind are left out."""
-        frames = self.unsound + self.strays + len(self.wrong["frames"])
-        return {"frames": frames, "velocities": int(self.slipped.sum())}
+        at = np.zeros(0, int) if self.odometry is None else self.odometry.node
+        velocities = int(np.isin(at, self.wrong["velocities"]).sum())
+        return {"frames": self.strays + len(self.wrong["frames"]), "velocities": velocities}
 
     @property
     def faults(self) -> tuple[str, ...]:
@@ -157,8 +158,8 @@ class Adjustment:
             )
         return tuple(said)
 
-    def settle(self, progress: Progress) -> tuple[Motion, Smoothed, int]:
-        """The motion, the solution of the last round, and how many rounds there were.
+    def settle(self, progress: Progress) -> tuple[Motion, Smoothed]:
+        """The motion, and the solution of the last round.
 
         VoyageError where the measurements do not go together, FixError where the place does not settle.
         """
@@ -192,7 +193,7 @@ class Adjustment:
             if settled and not self._revised(motion, chain, links, stars):
                 self._check_sun(motion, chain, stars)
                 progress("adjusting", 1.0)
-                return motion, solution, k + 1
+                return motion, solution
         raise FixError(
             f"the voyage's position does not converge (the last step was {step:.0f} m): check the IMU's "
             f"axes and units, and the stated vehicle"
@@ -340,25 +341,20 @@ class Adjustment:
         return ~(self.standing or NOWHERE).links(len(self.nodes))
 
     def _attitudes(self, zenith: np.ndarray | None) -> StarAttitudes:
-        """Attitudes of all frames whose stars agree, as seen under a zenith, or roughly."""
-        found, used = [], []
-        for frame in self.frames:
-            try:
-                air = self.vessel.atmosphere
-                found.append(frame.rough() if zenith is None else frame.under(zenith, air))
-                used.append(frame)
-            except FixError:
-                pass
-        self.unsound = len(self.frames) - len(used)
-        if len(used) < MIN_FRAMES:
-            raise VoyageError(f"the stars of {len(used)} frames agree: at least {MIN_FRAMES} are needed")
+        """Attitudes of all frames, as seen under a zenith, or roughly."""
+        if len(self.frames) < MIN_FRAMES:
+            raise VoyageError(
+                f"the stars of {len(self.frames)} frames agree: at least {MIN_FRAMES} are needed"
+            )
+        air = self.vessel.atmosphere
+        found = [frame.rough() if zenith is None else frame.under(zenith, air) for frame in self.frames]
         return StarAttitudes(
-            index=np.searchsorted(self.nodes, [frame.utc_unix_s for frame in used]),
+            index=np.searchsorted(self.nodes, [frame.utc_unix_s for frame in self.frames]),
             camera_to_itrs=np.array([a.rotation for a in found]),
             covariance=np.array([a.covariance_about_own for a in found]),
             by_refraction=np.array([a.rotation.T @ a.by_refraction for a in found]),
-            stamp_stddev_s=np.array([frame.stamp_stddev_s for frame in used]),
-            rays=np.array([f.ray if isinstance(f, SunFrame) else np.zeros(3) for f in used]),
+            stamp_stddev_s=np.array([frame.stamp_stddev_s for frame in self.frames]),
+            rays=np.array([f.ray if isinstance(f, SunFrame) else np.zeros(3) for f in self.frames]),
         )
 
     def _places(self, motion: Motion) -> Residuals:
@@ -376,19 +372,14 @@ class Adjustment:
     def _chain(self, motion: Motion, stars: StarAttitudes, before: Smoothed | None) -> tuple[Chain, Links]:
         """The equations about a motion, without measurements that a solution has shown to be wrong."""
         n, count = self.unknowns, len(motion)
-        sums = summed(
-            self.pieces,
-            motion.gyro_bias[:-1],
-            motion.accel_bias[:-1],
-            motion.gyro_matrix,
-            motion.accel_matrix,
-        )
+        sums = sums_of(self.pieces, motion)
         parts = [self._sound(star_residuals(motion, stars, sums, self.pieces, n), before, "frames")]
         if self._suns:
             parts.append(self._sound(self._places(motion), before, "places"))
         if self.odometry is not None:
-            parts.append(self._sound(self._velocities(motion, sums, before), before, "velocities"))
-        if self.vessel.parked:
+            measured = self.odometry.residuals(motion, sums, self.pieces, self.vibration, n)
+            parts.append(self._sound(measured, before, "velocities"))
+        if self.vessel.vehicle == PARKED:
             parts.append(standing_residuals(motion, np.arange(count), STANDING_SIGMA, n))
         rows = [part.whitened(count) for part in parts]
         if self.law is not None and self.odometry is None:
@@ -413,13 +404,6 @@ class Adjustment:
         rows = law_residuals(motion, self.law).whitened(len(motion))
         rows[stands.index] = stands.whitened(len(motion))[stands.index]
         return rows
-
-    def _velocities(self, motion: Motion, sums: Sums, before: Smoothed | None) -> Residuals:
-        assert self.odometry is not None
-        missed = self.odometry.missed(motion, sums, self.pieces)
-        if before is not None:
-            self.slipped = ~self.odometry.sound(missed)
-        return self.odometry.residuals(motion, missed, ~self.slipped, self.vibration, self.unknowns)
 
     def _sound(self, residuals: Residuals, before: Smoothed | None, kind: str) -> Residuals:
         """Equations without outliers, with wider errors where most of them scatter by more than is stated.
@@ -450,8 +434,7 @@ class Voyage:
     ----------
     faults : what is wrong with the record, in sentences
     excess, left_out : of frames and velocities, as `Adjustment` has them
-    rounds : of the adjustment
-    motion, solution : of its last round
+    motion : of its last round
     last : where it ends, to be carried on
 
     Examples
@@ -466,9 +449,7 @@ class Voyage:
     faults: tuple[str, ...]
     excess: dict[str, float]
     left_out: dict[str, int]
-    rounds: int
     motion: Motion
-    solution: Smoothed
     last: Estimate
 
 
@@ -496,7 +477,7 @@ def adjust_voyage(
     asked = np.concatenate([times[inside], [f.utc_unix_s for f in within]])
     nodes = nodes_of(np.unique(asked), MAX_APART_S)
     adjustment = Adjustment(within, nodes, Pieces.cut(imu, nodes), velocity, vessel, imu.vibration)
-    motion, solution, rounds = adjustment.settle(progress)
+    motion, solution = adjustment.settle(progress)
     stamp_s = float(np.median([f.stamp_stddev_s for f in within]))
     return Voyage(
         fixes=tuple(
@@ -506,9 +487,7 @@ def adjust_voyage(
         faults=(*imu.faults, *(() if velocity is None else velocity.faults), *adjustment.faults),
         excess=adjustment.excess,
         left_out=adjustment.left_out,
-        rounds=rounds,
         motion=motion,
-        solution=solution,
         last=Estimate(
             motion=motion.part(np.array([-1])),
             covariance=solution.covariance[-1],

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FrameError, InstrumentError, TimeError, VoyageError
+from starpos.errors import FixError, FrameError, InstrumentError, TimeError, VoyageError
 from starpos.fix.solver import Solver
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import AxisDoubt, Instrument, framed
 from starpos.navigation.records import ImuModel, read_imu, read_imu_model, read_velocity
-from starpos.navigation.sightings import IdentifiedFrame, sighting_of
+from starpos.navigation.sightings import PlacelessFrame, sighting_of
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, adjust_voyage
 from starpos.night.reading import First, Instruments, Reader
@@ -29,10 +29,10 @@ GIVEN_HEIGHT_STDDEV_M = 100.0
 
 @dataclass(frozen=True)
 class VoyageFrame:
-    """A frame's time, its identified stars, or why it has none, or a remark."""
+    """A frame's time, its attitude by stars, or why it has none, or a remark."""
 
     utc_unix_s: float | None
-    sighting: IdentifiedFrame | None
+    sighting: PlacelessFrame | None
     message: str = ""
 
 
@@ -51,7 +51,7 @@ class IdentifyingVoyage:
         eye, time_s = Solver(instrument, catalogue.load_catalogue()), item.mid_unix_s
         try:
             return VoyageFrame(time_s, sighting_of(sight.stars, eye, sight.solution), sight.solution.remark)
-        except (FrameError, TimeError) as error:
+        except (FrameError, FixError, TimeError) as error:
             return VoyageFrame(time_s, None, str(error))
 
 

@@ -72,10 +72,9 @@ class _Block:
     def weight(self) -> np.ndarray:
         return np.linalg.inv(self.total)
 
-    def offset(self, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The satellite's offset (3,) after a step (6,) of all unknowns, and its covariance (3, 3) at that place."""
-        gain = self.prior @ self.by_offset.T @ self.weight
-        return gain @ (self.residual - self.by_place @ step), self.prior - gain @ self.by_offset @ self.prior
+    def offset(self, step: np.ndarray) -> np.ndarray:
+        """The satellite's offset (3,) after a step (6,) of all unknowns."""
+        return self.prior @ self.by_offset.T @ self.weight @ (self.residual - self.by_place @ step)
 
 
 @at_once
@@ -85,7 +84,7 @@ class PlaceAdjustment:
 
     covariance (6, 6): of east, north, up (m), the clock (s), and the errors that sightings by hand share; widened by
     `scale`, a factor of variances.
-    offset_m, offset_sigma_m (T, 3): each trail's satellite against its orbit: radial, along, across (left from above);
+    offset_m (T, 3): each trail's satellite against its orbit: radial, along, across (left from above);
     NaN of a trail that is not used.
     used (T,); probability (T,): of so large a residual by chance.
     """
@@ -94,7 +93,6 @@ class PlaceAdjustment:
     clock_s: float
     covariance: np.ndarray
     offset_m: np.ndarray
-    offset_sigma_m: np.ndarray
     used: np.ndarray
     probability: np.ndarray
     chi2: float
@@ -178,16 +176,15 @@ class Adjuster:
             covariance = np.linalg.inv(normal)
             step = covariance @ right
             for block in blocks:
-                offsets[block.trails] = block.offset(step)[0]
+                offsets[block.trails] = block.offset(step)
             place, clock_s = place + enu.T @ step[:3], clock_s + float(step[3])
             if np.linalg.norm(step[:3]) < STILL_M:
                 break
         degrees = sum(len(block.residual) for block in blocks) + known - len(step)
         chi2 = max(chi2 - float(step @ right), 0.0)
         scale = max(chi2 / degrees, 1.0) if degrees > 0 and special.chdtrc(degrees, chi2) < SCATTER else 1.0
-        sigma, probability = np.full((len(used), 3), np.nan), np.full(len(used), np.nan)
+        probability = np.full(len(used), np.nan)
         for block in blocks:
-            sigma[block.trails] = np.sqrt(np.diag(block.offset(step)[1]))
             for trail in block.trails:
                 probability[trail] = self._chance(block, block.of_row == trail, step, covariance)
         offsets[~used] = np.nan
@@ -196,7 +193,6 @@ class Adjuster:
             clock_s=clock_s,
             covariance=covariance * scale,
             offset_m=offsets,
-            offset_sigma_m=sigma,
             used=used,
             probability=probability,
             chi2=chi2,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Orbits of satellites from files: mean elements (TLE, 3LE; OMM in JSON, XML, CSV, KVN), and ephemerides (OEM, SP3).
+"""Orbits of satellites from files: mean elements (TLE, 3LE; OMM in JSON, XML, CSV), and ephemerides (OEM, SP3).
 
 Mean elements are for SGP4 with the constants of WGS 72 alone (Hoots and Roehrich 1980, Spacetrack Report 3; Vallado et
 al. 2006, AIAA 2006-6753), by the package sgp4; OMM and OEM are CCSDS 502.0-B, SP3 is the IGS's (Hilla 2016).
@@ -23,6 +23,7 @@ from numpy.polynomial import polynomial
 from starpos.earth.orientation import TT_MINUS_TAI_S, EarthState, earth_state, tai_minus_utc
 from starpos.errors import SatelliteError, StarposError, one_line
 from starpos.files import read_regular
+from starpos.tables import packaged
 from starpos.units import DAY_S, UNIX_EPOCH_JD, unix_of, utc_text
 
 MOST_BYTES = 300_000_000
@@ -38,42 +39,22 @@ POINTS = 9
 class OrbitErrors(NamedTuple):
     """Prior errors (1 sigma) of a class of orbits, m, at once and per day: along the motion, and across and radially."""
 
-    what: str
     along_m: float
     along_m_per_day: float
     across_m: float
     across_m_per_day: float
     max_age_days: float
 
-    def sigma(self, age_days: float) -> np.ndarray:
-        """Standard deviations (3,) in m: radial, along, across."""
-        days = abs(age_days)
+    def sigma(self, age_days: float | np.ndarray) -> np.ndarray:
+        """Standard deviations (..., 3) in m: radial, along, across, of orbits that are so old (...)."""
+        days = np.abs(age_days)
         across = self.across_m + self.across_m_per_day * days
-        return np.array([across, self.along_m + self.along_m_per_day * days, across])
+        return np.stack([across, self.along_m + self.along_m_per_day * days, across], -1)
 
 
-# Flohrer, Krag and Klinkrad (2008, AMOS) compare elements with measured orbits: 0.1 to 0.5 km across, 0.3 to 2 km along
-# in low orbits. Drag makes the error along the motion grow (Levit and Marshall 2011, Adv. Space Res. 47, 1107); who
-# manoeuvres by electric thrust leaves the elements faster. One without a name may do either.
-PASSIVE = OrbitErrors("passive", 100.0, 250.0, 150.0, 50.0, 30.0)
-MANOEUVRING = OrbitErrors("that manoeuvre", 0.0, 4000.0, 150.0, 50.0, 14.0)
-GEOSTATIONARY = OrbitErrors("geostationary", 500.0, 1000.0, 500.0, 200.0, 30.0)
-UNNAMED = OrbitErrors("without a name", 200.0, 1000.0, 300.0, 150.0, 30.0)
-OPERATORS = OrbitErrors("of an operator's ephemeris", 30.0, 300.0, 30.0, 30.0, 8.0)
-PRECISE = OrbitErrors("of a precise ephemeris", 1.0, 0.0, 1.0, 0.0, math.inf)
-# names of constellations and stations that keep their orbits by thrust
-THRUST = (
-    "STARLINK",
-    "ONEWEB",
-    "KUIPER",
-    "QIANFAN",
-    "HULIANWANG",
-    "IRIDIUM",
-    "ISS (",
-    "CSS (",
-    "TIANGONG",
-    "GLOBALSTAR",
-)
+_ROWS = {row.pop("class"): row for row in packaged("starpos.satellites", "orbit_classes.csv")}
+THRUST = tuple(_ROWS["manoeuvring"]["names"].split("|"))
+CLASSES = {name: OrbitErrors(*(float(row[f]) for f in OrbitErrors._fields)) for name, row in _ROWS.items()}
 GEOSTATIONARY_PER_DAY = 0.9, 1.1
 
 
@@ -115,6 +96,12 @@ class Orbit:
     def age_days(self, utc_unix_s: float) -> float:
         """Time since the epoch."""
         return (utc_unix_s - self.epoch_unix_s) / DAY_S
+
+    def reaches(self, utc_unix_s: float) -> bool:
+        """Whether an ephemeris has that time, or elements are not too old for it."""
+        if self.ephemeris is not None:
+            return bool(self.ephemeris.utc_unix_s[0] <= utc_unix_s <= self.ephemeris.utc_unix_s[-1])
+        return abs(self.age_days(utc_unix_s)) <= self.errors.max_age_days
 
 
 def read_orbits(path: Path | str) -> tuple[list[Orbit], list[str]]:
@@ -182,7 +169,7 @@ class StoredOrbits:
         return [(f.name, (state := f.stat()).st_mtime_ns, state.st_size) for f in files]
 
 
-CURE = "give TLE, OMM (JSON, XML, CSV or KVN), OEM or SP3"
+CURE = "give TLE, OMM (JSON, XML or CSV), OEM or SP3"
 
 
 def _orbits(text: str) -> Iterator[Orbit | str]:
@@ -199,15 +186,6 @@ def _orbits(text: str) -> Iterator[Orbit | str]:
         if any(e.tag.rpartition("}")[2] == "stateVector" for e in root.iter()):
             raise ValueError("an OEM in XML: give it as text (KVN)")
         yield from _from_omm(_xml_rows(root))
-    elif start.startswith("CCSDS_OMM_VERS"):
-        parts = (part.splitlines() for part in text.split("CCSDS_OMM_VERS")[1:])
-        yield from _from_omm(
-            {
-                key.strip(): value.split("[")[0].strip()
-                for key, _, value in (line.partition("=") for line in part)
-            }
-            for part in parts
-        )
     elif start.startswith("CCSDS_OEM_VERS"):
         yield from _from_oem(text)
     elif start[:2] in ("#a", "#b", "#c", "#d"):
@@ -220,10 +198,10 @@ def _orbits(text: str) -> Iterator[Orbit | str]:
 
 def _class_of(name: str, per_day: float) -> OrbitErrors:
     if GEOSTATIONARY_PER_DAY[0] < per_day < GEOSTATIONARY_PER_DAY[1]:
-        return GEOSTATIONARY
+        return CLASSES["geostationary"]
     if name.upper().startswith(THRUST):
-        return MANOEUVRING
-    return PASSIVE if name else UNNAMED
+        return CLASSES["manoeuvring"]
+    return CLASSES["passive"] if name else CLASSES["unnamed"]
 
 
 def _of_record(number: int, name: str, record: Any) -> Orbit | str:
@@ -243,6 +221,7 @@ def _of_record(number: int, name: str, record: Any) -> Orbit | str:
 def _from_lines(text: str) -> Iterator[Orbit | str]:
     """Two lines a satellite, with or without a line of its name before (Spacetrack Report 3; Kelso 1998)."""
     from sgp4.api import Satrec
+    from sgp4.io import compute_checksum
 
     lines = [line.rstrip() for line in text.splitlines()]
     before = ""
@@ -258,7 +237,11 @@ def _from_lines(text: str) -> Iterator[Orbit | str]:
             yield f"line {number}: no second line of the same satellite follows"
             continue
         number += 1
-        wrong = [n for n, text_ in ((number - 1, line), (number, second)) if not _sums(text_)]
+        wrong = [
+            n
+            for n, text_ in ((number - 1, line), (number, second))
+            if text_[68:69] != str(compute_checksum(text_))
+        ]
         if wrong:
             yield f"line {wrong[0]}: its check sum is wrong"
         else:
@@ -271,12 +254,6 @@ def _from_lines(text: str) -> Iterator[Orbit | str]:
             except ValueError as e:
                 yield f"line {number}: {one_line(e)}"
         before = ""
-
-
-def _sums(line: str) -> bool:
-    """Whether the last digit of a line is the sum of all digits before, a minus counting 1."""
-    body, last = line[:68], line[68:69]
-    return last.isdigit() and int(last) == sum(int(c) if c.isdigit() else c == "-" for c in body) % 10
 
 
 def _xml_rows(root: ET.Element) -> Iterator[dict]:
@@ -348,7 +325,7 @@ def _from_oem(text: str) -> Iterator[Orbit | str]:
         key, equals, value = (part.strip() for part in line.partition("="))
         if key == "META_START":
             if rows:
-                yield _of_states(_number_of(about), about.get("OBJECT_NAME", ""), OPERATORS, rows)
+                yield _of_states(_number_of(about), about.get("OBJECT_NAME", ""), CLASSES["operators"], rows)
             about, rows = {}, []
         elif key.startswith("COVARIANCE_ST"):
             skipped = key == "COVARIANCE_START"
@@ -427,7 +404,7 @@ def _from_sp3(text: str) -> Iterator[Orbit | str]:
             if place.any():
                 rows.setdefault(line[1:4], []).append((utc, place @ turn.T))
     for name, states in rows.items():
-        yield _of_states(_number_of({"OBJECT_ID": name}), name, PRECISE, states)
+        yield _of_states(_number_of({"OBJECT_ID": name}), name, CLASSES["precise"], states)
 
 
 def chosen(
@@ -439,25 +416,18 @@ def chosen(
     """
     best: dict[int, Orbit] = {}
     left_out = {"newer": set[int](), "older": set[int]()}
-    last_epoch = -math.inf
-    for orbit in orbits:
-        age = orbit.age_days(utc_unix_s)
-        if orbit.ephemeris is not None:
-            if not orbit.ephemeris.utc_unix_s[0] <= utc_unix_s <= orbit.ephemeris.utc_unix_s[-1]:
-                left_out["older"].add(orbit.number)
-                continue
-        elif abs(age) > orbit.errors.max_age_days:
+
+    def certain(orbit: Orbit) -> tuple[float, float]:
+        days = abs(orbit.age_days(utc_unix_s))
+        return orbit.errors.along_m + orbit.errors.along_m_per_day * days, days
+
+    # the best of a satellite comes last
+    for orbit in sorted(orbits, key=certain, reverse=True):
+        if not orbit.reaches(utc_unix_s):
             left_out["older"].add(orbit.number)
-            last_epoch = max(last_epoch, orbit.epoch_unix_s)
-            continue
-        elif age < 0 and not newer:
+        elif orbit.ephemeris is None and orbit.epoch_unix_s > utc_unix_s and not newer:
             left_out["newer"].add(orbit.number)
-            continue
-        held = best.get(orbit.number)
-        if held is None or (orbit.errors.sigma(age)[1], abs(age)) < (
-            held.errors.sigma(held.age_days(utc_unix_s))[1],
-            abs(held.age_days(utc_unix_s)),
-        ):
+        else:
             best[orbit.number] = orbit
     newer_only, older_only = (len(left_out[key] - set(best)) for key in ("newer", "older"))
     said = []
@@ -467,9 +437,10 @@ def chosen(
             "--newer-elements alone"
         )
     if older_only:
+        passive, manoeuvring = (CLASSES[name].max_age_days for name in ("passive", "manoeuvring"))
         said.append(
             f"the orbits of {older_only} satellites do not reach {utc_text(utc_unix_s)}, or are older than their class "
-            f"allows ({PASSIVE.max_age_days:.0f} days, {MANOEUVRING.max_age_days:.0f} for those that manoeuvre)"
+            f"allows ({passive:.0f} days, {manoeuvring:.0f} for those that manoeuvre)"
         )
     if not best:
         raise SatelliteError(f"{'; '.join(said) or 'there are no orbits'}: get elements of that day")

@@ -35,6 +35,7 @@ class SatelliteFix:
 
     latitude, longitude (rad), height_m: on WGS 84.  covariance (3, 3): east, north, up, m2.
     named: for each trail its orbit, or None.  adjusted: row of each trail in the adjustment, or -1.
+    satellites: number of different ones that the place stands on.
     """
 
     latitude: float
@@ -45,6 +46,7 @@ class SatelliteFix:
     clock_stddev_s: float
     named: tuple[Orbit | None, ...]
     adjusted: np.ndarray
+    satellites: int
     adjustment: PlaceAdjustment
 
     @property
@@ -58,16 +60,6 @@ class SatelliteFix:
             f"{self.clock_stddev_s:.3f}; {a.used.sum()} trails of {self.satellites} satellites, chi-square "
             f"{a.chi2:.1f} of {a.degrees}{widened}"
         )
-
-    @property
-    def satellites(self) -> int:
-        """Number of different satellites that the place stands on."""
-        rows = [
-            orbit
-            for orbit, k in zip(self.named, self.adjusted, strict=True)
-            if k >= 0 and self.adjustment.used[k]
-        ]
-        return len({orbit.number for orbit in rows if orbit is not None})
 
 
 def locate(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: KnownBefore) -> SatelliteFix:
@@ -168,5 +160,6 @@ def _fix(
         clock_stddev_s=float(np.sqrt(answer.covariance[3, 3])),
         named=tuple(named),
         adjusted=adjusted,
+        satellites=len(satellites),
         adjustment=answer,
     )

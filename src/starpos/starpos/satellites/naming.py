@@ -16,7 +16,7 @@ from starpos.earth.gravity import SPIN
 from starpos.errors import SatelliteError
 from starpos.frozen import at_once
 from starpos.rotation import normalised
-from starpos.satellites.elements import Orbit
+from starpos.satellites.elements import Orbit, OrbitErrors
 from starpos.satellites.orbits import Moments, along_axes, enu_at
 from starpos.satellites.trails import SatelliteTrail
 from starpos.units import DAY_S, UNIX_EPOCH_JD
@@ -78,14 +78,12 @@ class OrbitsAbove:
         self._records = SatrecArray([o.record for o in orbits if o.ephemeris is None])
         self.count = len(orbits)
         self._epochs = np.array([o.epoch_unix_s for o in orbits])
-        at_once = np.array([o.errors.sigma(0.0) for o in orbits])
-        self._errors = at_once, np.array([o.errors.sigma(1.0) for o in orbits]) - at_once
+        self._errors = np.array([o.errors for o in orbits], float).reshape(-1, len(OrbitErrors._fields))
         self._nodes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def sigma(self, rows: np.ndarray, utc_unix_s: float) -> np.ndarray:
         """Prior errors (K, 3) of some orbits, m: radial, along, across."""
-        at_once, per_day = self._errors[0][rows], self._errors[1][rows]
-        return at_once + per_day * np.abs(utc_unix_s - self._epochs[rows, None]) / DAY_S
+        return OrbitErrors(*self._errors[rows].T).sigma((utc_unix_s - self._epochs[rows]) / DAY_S)
 
     def toward(self, direction: np.ndarray, utc_unix_s: float) -> np.ndarray:
         """Rows (K,) of the orbits that may stand in a direction (3,) in ITRS from the ground, and some more."""
@@ -250,10 +248,8 @@ def agreement(found: Candidates, orbits: Sequence[Orbit]) -> Agreement:
     chance = np.log(GROUND_M2 / counts)
     spread = np.linalg.eigvalsh(found.covariance)
     starts = np.lexsort((spread[:, 1] * spread[:, 2], counts))[:MOST_STARTS]
-    tried = sorted((_fused(found, chance, int(k), steps=0) for k in starts), key=lambda a: -a.score)
-    better = sorted(
-        (_fused(found, chance, int(a.members[0]), steps=3) for a in tried[:FUSED]), key=lambda a: -a.score
-    )
+    tried = sorted(starts.tolist(), key=lambda k: -_fused(found, chance, k, steps=0).score)
+    better = sorted((_fused(found, chance, k, steps=3) for k in tried[:FUSED]), key=lambda a: -a.score)
     best = better[0]
     satellites = {orbits[k].number for k in found.orbit[best.members]}
     if (
@@ -290,12 +286,8 @@ def _fused(found: Candidates, chance: np.ndarray, start: int, steps: int) -> Agr
             if len(members):
                 own = np.linalg.inv(weights.sum(0))
                 mean = own @ np.einsum("kij,kj->i", weights, points[members])
-    rest = members[members != start]
-    return Agreement(
-        place=place + plane.T @ mean,
-        members=np.concatenate([[start], rest]) if steps == 0 else members,
-        score=float(score[rest].sum()),
-    )
+    score = score[members[members != start]].sum()
+    return Agreement(place=place + plane.T @ mean, members=members, score=float(score))
 
 
 def _scores(off: np.ndarray, covariance: np.ndarray, chance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -250,17 +250,16 @@ class NavigatorSession:
     def _adjust(self, time_s: float) -> None:
         """Begin an adjustment if one is due."""
         recent, values = self._recent, self._values
-        period_s = max(values["adjust_period"], recent.frames / FRAMES_PER_S)
+        period_s = max(values["adjust_period"], len(recent.frames) / FRAMES_PER_S)
         if self._jobs.busy or time_s < self._adjusted_s + period_s or recent.newest_frame_s <= self._seen_s:
             return
-        record = recent.record()
-        inside = [f for f in record.frames if f.utc_unix_s <= time_s]
-        if len(inside) < MIN_FRAMES or time_s - record.blocks[0][0, 0] < SHORTEST_S:
+        inside = [f for f in recent.frames if f.utc_unix_s <= time_s]
+        if len(inside) < MIN_FRAMES or time_s - recent.readings.first_s < SHORTEST_S:
             return
         self._adjusted_s = time_s
         vessel, voyage = self._settings.vessel(self._clock_stddev_s), self._voyage
         sun = next((f for f in reversed(inside) if isinstance(f, SunFrame)), None)
-        self._jobs.run(lambda: record.adjusted(vessel)).add_done_callback(
+        self._jobs.run(recent.job(vessel)).add_done_callback(
             lambda f: self._adjusted(f.result(), voyage, sun)
         )
 
@@ -289,7 +288,7 @@ class NavigatorSession:
 
     @property
     def _is_measured(self) -> bool:
-        return self._recent.velocities > 0 or self._values["vehicle"] == PARKED
+        return bool(self._recent.velocities) or self._values["vehicle"] == PARKED
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
@@ -341,11 +340,11 @@ class NavigatorSession:
         estimate, known, recent = self._estimate, self._known, self._recent
         values: dict[str, object] = {
             **self.counts,
-            "frames in the window": recent.frames,
-            "velocities in the window": recent.velocities,
+            "frames in the window": len(recent.frames),
+            "velocities in the window": len(recent.velocities),
         }
         if estimate is None or known is None:
-            apart = recent.frames >= MIN_FRAMES and recent.newest_frame_s == -math.inf
+            apart = len(recent.frames) >= MIN_FRAMES and recent.newest_frame_s == -math.inf
             return Diagnosis(Level.WARN, APART if apart else self._trouble, values)
         since_s = recent.readings.last_s - self._seen_s
         speed = float(np.sqrt(np.trace(estimate.fix.velocity_covariance) / 3))

@@ -29,6 +29,10 @@ OTHER_TILTS = (
     "by its stars the camera has not moved, by the tilts at its stamp it has: these are of another time; "
     + ONE_CLOCK
 )
+OTHER_LEVEL = (
+    "by its stars the camera stands, but the level puts it at another place than before, further off than its errors "
+    "allow: the level was set to zero, or knocked; confirm it with solver/reset, then calibrate A3 anew"
+)
 
 
 def of_site(site: Place) -> dict[str, float]:

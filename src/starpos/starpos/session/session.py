@@ -38,7 +38,7 @@ from starpos.session.gyro import Gyro
 from starpos.session.pace import MAX_WAITING, Backlog, Pace, Waiting
 from starpos.session.settings import Settings
 from starpos.session.solving import AT_ONCE_S, Search, attitude_beside
-from starpos.session.standing import ClockDoubt
+from starpos.session.standing import ClockDoubt, LevelDoubt
 from starpos.session.tilts import TiltBuffer
 from starpos.sky import catalogue
 
@@ -52,6 +52,8 @@ J2000_UNIX_S = 946_728_000.0
 CLOCK_SIGMAS = 6.0
 # A clock that goes back by more was set.
 STEP_S = 0.05
+# parameters by which A3 or the level's errors become others
+OF_MOUNTING = ("calibration_url", "inclinometer.model", "misalignment", "misalignment_stddev")
 CAMERA_TOPIC = "camera/camera_info"
 
 
@@ -82,6 +84,7 @@ class SolverSession:
         self.more = False
         self.tilts = TiltBuffer()
         self.doubt = ClockDoubt()
+        self._level = LevelDoubt()
         self.gyro = Gyro(heard)
         self.satellites: LiveSatellites | None = None
         if settings.orbits is not None:
@@ -115,7 +118,7 @@ class SolverSession:
             topic,
         )
         self.calibrating = Calibrating(
-            settings, jobs(), lambda: self.instrument.solver_now, self.instrument.remake, log
+            settings, jobs(), lambda: self.instrument.solver_now, self._other_calibration, log
         )
         if unnamed := unnamed_inclinometer(settings.instrument(None), MODEL_BY_PARAMETERS):
             log.warning(unnamed)
@@ -123,10 +126,15 @@ class SolverSession:
     def _make_solver(self, camera: Camera) -> Solver:
         return self._settings.solver(camera, self.calibrating.found, self._catalogue)
 
+    def _other_calibration(self) -> None:
+        self._level.clear()
+        self.instrument.remake()
+
     def _other_camera(self) -> None:
         self._hint = None
         self._search.other_camera()
         self._glows = Glows()
+        self._level.clear()
         self.gyro.forget()
         if self.gnss is not None:
             self.gnss.other_camera()
@@ -152,6 +160,8 @@ class SolverSession:
         """Apply a change of these parameters."""
         if "clock_stddev" in names:
             self.doubt.clear()
+        if not names.isdisjoint(OF_MOUNTING):
+            self._level.clear()
         self.calibrating.parameters_set(names)
         self.deflection.parameters_set(names)
         self.instrument.remake()
@@ -397,13 +407,16 @@ class SolverSession:
         return self._guarded(work, lambda e: _failed(frame, "the solver failed on this frame", e))
 
     def _with_doubt(self, frame: Waiting, answer: Solution, fix: Fix) -> tuple[Waiting, Solution]:
-        """Add the error of its time that the stars of earlier frames show to a frame and its answer."""
+        """What earlier frames show of a frame's time and level: it has the time's error, or no fix."""
         stated_s = math.hypot(
             self.instrument.solver_now.clock_stddev_s(frame.stars), frame.stars.stamp_stddev_s
         )
         self.doubt.judge(fix, stated_s)
         if self.doubt.seconds <= stated_s:
-            return frame, answer
+            if not self._level.contradicts(fix, stated_s):
+                return frame, answer
+            refused = Solution.failed(frame.stars, Status.NO_TILT, reports.OTHER_LEVEL)
+            return replace(frame, doubted=True), refused
         frame = replace(frame, stars=replace(frame.stars, clock_stddev_s=self.doubt.seconds), doubted=True)
         if self.doubt.leans_otherwise:
             return frame, Solution.failed(frame.stars, Status.NO_TILT, reports.OTHER_TILTS)
@@ -488,6 +501,7 @@ class SolverSession:
         if self.satellites is not None:
             self.satellites.forget()
         self.doubt.clear()
+        self._level.clear()
         self.calibrating.forget()
         self.deflection.forget()
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from starpos.earth.orientation import earth_state
 from starpos.errors import StarposError
 from starpos.fix import searching
 from starpos.fix.attitude import CameraAttitude
@@ -77,18 +78,17 @@ def camera_attitude_of(
     found = answer.found
     try:
         frame = sighting_of(stars, solver, answer)
-        seen = frame.placeless()
     except StarposError:
         return None
     assert found is not None
-    gcrs_to_itrs = frame.camera.rotation @ found.attitude
+    gcrs_to_itrs = earth_state(frame.utc_unix_s).gcrs_to_itrs
     return CameraAttitude(
         utc_unix_s=frame.utc_unix_s,
         stamp_stddev_s=stars.stamp_stddev_s,
         clock_stddev_s=solver.clock_stddev_s(stars),
         frame_id=frame_id,
-        camera_to_gcrs=gcrs_to_itrs.T @ seen.rotation,
-        covariance=seen.covariance_about_own,
+        camera_to_gcrs=gcrs_to_itrs.T @ frame.camera.rotation,
+        covariance=frame.camera.covariance_about_own,
         stars=len(found.star),
         log_odds=found.log_odds,
     )

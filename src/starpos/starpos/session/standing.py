@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fixes of an instrument at rest, taken together: their average, and whether a clock was set."""
+"""The fixes of an instrument at rest, taken together: their average, and whether a clock was set or the level changed."""
 
 import math
 from enum import Enum, auto
@@ -130,7 +130,7 @@ def _sigmas_apart(a: Average, b: Average) -> float:
     return float(np.sqrt(apart @ np.linalg.solve((a.covariance + b.covariance)[:2, :2], apart)))
 
 
-# Number of agreeing frames that outvote a single earlier one: that one was stamped wrongly, and no clock was set.
+# Number of agreeing frames that outvote a single earlier one: that one was wrong, and no clock or level was set.
 OUTVOTE_ONE = 10
 
 
@@ -186,6 +186,56 @@ class ClockDoubt:
     def _both(self, stated_s: float) -> float:
         """Standard deviation of the difference between a stamp and the first fix's stamp."""
         return math.hypot(stated_s, self._first_stated_s)
+
+
+# A contradiction by this number of fixes in a row is no passing fault.
+LASTING = 2
+
+
+class LevelDoubt:
+    """Judges the level while the stars show that the camera stands still: was it set to zero, or knocked?
+
+    Which of two levels is right is unknown: the first of a pose counts, unless only one fix had it. After a lasting
+    contradiction the level is not believed in later poses either, until the user confirms it.
+    """
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all doubt, because the user confirms the level or A3 is new."""
+        # the first fix of this pose, and how many agree with it
+        self._first: Fix | None = None
+        self._agree = 0
+        # the last of the fixes that contradict it in the same way, and how many there are
+        self._other: Fix | None = None
+        self._others = 0
+
+    def contradicts(self, fix: Fix, stated_s: float) -> bool:
+        """Take a fix; whether its level contradicts the one that counts.  stated_s: 1 sigma of its time."""
+        first = self._first
+        if first is None or slip_s(fix.camera, first.camera, fix.latitude, math.sqrt(2) * stated_s) != 0:
+            if self._others < LASTING:
+                self._begin(fix, 1)
+        elif _at_one_place(fix, first):
+            self._agree, self._others = self._agree + 1, 0
+        else:
+            again = self._others > 0 and self._other is not None and _at_one_place(fix, self._other)
+            self._other, self._others = fix, self._others + 1 if again else 1
+            if self._agree == 1 and self._others == OUTVOTE_ONE:
+                self._begin(fix, OUTVOTE_ONE)
+        return self._others > 0
+
+    def _begin(self, fix: Fix, agree: int) -> None:
+        self._first, self._agree, self._others = fix, agree, 0
+
+
+def _at_one_place(fix: Fix, before: Fix) -> bool:
+    """Whether the claimed errors of two fixes of one pose, and the mount's creep, explain how far they are apart."""
+    zeniths = (zenith_of(f.latitude, f.longitude) for f in (fix, before))
+    apart_m = EARTH_RADIUS_M * np.linalg.norm(np.subtract(*zeniths))
+    claimed_m = np.sqrt(sum(np.trace(f.covariance[:2, :2]) for f in (fix, before)))
+    return bool(apart_m <= SLIP_SIGMAS * claimed_m + CREEP_RAD * EARTH_RADIUS_M)
 
 
 def _spread(fix: Fix) -> float:

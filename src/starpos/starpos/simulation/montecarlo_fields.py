@@ -201,6 +201,17 @@ class Tally:
         """Number of fields."""
         return self.correct + self.wrong + self.none
 
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % confidence interval (Wilson 1927) of the probability of a right answer."""
+        # slow to import
+        from scipy.stats import binomtest
+
+        if not self.fields:
+            return 0.0, 1.0
+        low, high = binomtest(self.correct, self.fields).proportion_ci(method="wilson")
+        return float(low), float(high)
+
     def ask(self, given: Field, stars: Stars, answer: Answer, tolerance_rad: float) -> None:
         """Count the answer to one more field, given as stars."""
         begin = time.process_time()
@@ -212,13 +223,3 @@ class Tally:
             self.correct += 1
         else:
             self.wrong += 1
-
-
-def wilson(successes: int, n: int) -> tuple[float, float]:
-    """95 % confidence interval of a probability, after a number of successes in n trials (Wilson 1927)."""
-    if n == 0:
-        return 0.0, 1.0
-    z2, p = 1.96**2, successes / n
-    middle = (p + z2 / (2 * n)) / (1 + z2 / n)
-    half = np.sqrt(z2 * (p * (1 - p) / n + z2 / (4 * n * n))) / (1 + z2 / n)
-    return max(0.0, float(middle - half)), min(1.0, float(middle + half))

@@ -94,12 +94,13 @@ def _with_exif(jpeg: bytes, start_utc: str, up: np.ndarray) -> bytes:
     """A JPEG with the EXIF of a telephone; up (3,): unit vector in C that its accelerometer felt."""
     day, _, rest = start_utc.partition("T")
     seconds, _, fraction = rest.partition(".")
+    note = _apples_note(up)
     exif: Tags = {
         0x829A: (RATIONAL, 1, struct.pack(">II", EXPOSURE_TENTHS_S, 10)),
         0x9003: _text(f"{day.replace('-', ':')} {seconds}"),
         0x9011: _text("+00:00"),
         0x920A: (RATIONAL, 1, struct.pack(">II", round(100 * FOCAL_MM), 100)),
-        0x927C: _bytes(_apples_note(up)),
+        0x927C: (UNDEFINED, len(note), note),
         0x9291: _text(fraction[:3]),
         0xA405: (SHORT, 1, struct.pack(">H", FILM_MM)),
     }
@@ -134,7 +135,3 @@ def _directory(tags: Tags, at: int) -> bytes:
 
 def _text(words: str) -> tuple[int, int, bytes]:
     return ASCII, len(words) + 1, words.encode("ascii") + b"\0"
-
-
-def _bytes(value: bytes) -> tuple[int, int, bytes]:
-    return UNDEFINED, len(value), value

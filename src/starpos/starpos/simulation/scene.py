@@ -58,14 +58,13 @@ class Optics:
 
 @dataclass(frozen=True)
 class TiltErrors:
-    """Errors of an inclinometer reading in rad: white noise, zero per axis, its drift per hour, and the step `quantum`.
+    """Errors of an inclinometer reading in rad: white noise, zero per axis, and the step `quantum`.
 
     scale: relative error of the angle itself, by axis.
     """
 
     noise: float = np.radians(0.0035)
     zero: tuple[float, float] = (0.0, 0.0)
-    drift_hour: tuple[float, float] = (0.0, 0.0)
     scale: tuple[float, float] = (0.0, 0.0)
     quantum: float = np.radians(0.0035 / 8)
 
@@ -212,10 +211,10 @@ def _star_light(camera: Camera, optics: Optics, stars: Exposed) -> tuple[np.ndar
     return (y * camera.width + x)[on], image[on].astype(np.float32)
 
 
-def read_tilt(scene: Scene, hours: float, rng: np.random.Generator) -> tuple[float, float]:
-    """One inclinometer reading theta_x, theta_y (rad), `hours` after the drift of its zero began."""
+def read_tilt(scene: Scene, rng: np.random.Generator) -> tuple[float, float]:
+    """One inclinometer reading theta_x, theta_y (rad)."""
     e = scene.tilt_errors
-    theta = np.array(scene.tilt) * (1 + np.asarray(e.scale)) + e.zero + hours * np.asarray(e.drift_hour)
+    theta = np.array(scene.tilt) * (1 + np.asarray(e.scale)) + e.zero
     theta += rng.normal(0, 1, 2) * e.noise
     if e.quantum:
         theta = np.round(theta / e.quantum) * e.quantum
@@ -292,8 +291,7 @@ def detected(
     source: str = "simulated",
 ) -> Stars:
     """The list of a good detector: errors by photon noise with a floor of 0.02 px, stars of SNR above 6 only."""
-    optics, camera = scene.optics, scene.camera
-    sky = optics.zero_point_e_s * exposure_s * 10 ** (-0.4 * optics.sky_mag_arcsec2) * camera.scale_arcsec**2
+    optics, camera, sky = scene.optics, scene.camera, scene.sky_e_s * exposure_s
     area = np.pi * optics.fwhm_px**2
     snr = stars.electrons / np.sqrt(stars.electrons + area * (sky + optics.read_noise_e**2))
     sigma = np.hypot(optics.fwhm_px / FWHM_PER_SIGMA / snr, CENTROID_FLOOR_PX)
@@ -387,7 +385,7 @@ def write_night(
             samples = max(1, round(exposure_s * TILT_RATE_HZ))
             for j in range(samples):
                 moment = start + (j + 0.5) * exposure_s / samples
-                tilts.append((moment, *np.degrees(read_tilt(now, (moment - begin) / 3600, rng)), 15.0))
+                tilts.append((moment, *np.degrees(read_tilt(now, rng)), 15.0))
             truth.append({"start_utc": date_obs(start), "mid_unix_s": start + exposure_s / 2,
                           "heading_deg": float(np.degrees(now.heading)), "stars": len(stars.electrons)})  # fmt: skip
             progress("frames", (k + 1) / frames)

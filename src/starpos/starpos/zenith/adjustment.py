@@ -12,6 +12,7 @@ they determine that size, too, and the errors grow by it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -43,61 +44,6 @@ class FaceQuality:
     off_arcsec: np.ndarray
     stddev_arcsec: np.ndarray
     chi2: float
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Leftover:
-    """What the unknowns of an adjustment leave of N frames' readings, for tests of what else there may be.
-
-    by_lean (N, 2, 2), by_second (N, 2): derivatives of the readings by xi and eta, and by a second of the clock, rad.
-    projector (2 N, 2 N), weighted (2 N,): weights that the unknowns leave, and the weighted residuals.
-    """
-
-    by_lean: np.ndarray
-    by_second: np.ndarray
-    projector: np.ndarray
-    weighted: np.ndarray
-
-    def tested(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """The best multiple (m,) of further columns (N, 2, m), its normal matrix, and by how much chi-square falls."""
-        flat = columns.reshape(-1, columns.shape[2])
-        normal = flat.T @ self.projector @ flat
-        right = flat.T @ self.weighted
-        step = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
-        return step, normal, float(step @ right)
-
-    def excess(self, covariance: np.ndarray) -> float:
-        """How many sigma more of an error of this covariance (2 N, 2 N) the residuals have than the weights assume."""
-        weighted = self.projector @ covariance
-        more = self.weighted @ covariance @ self.weighted - np.trace(weighted)
-        spread = np.sqrt(2 * np.sum(weighted * weighted.T))
-        return float(more / spread) if spread > 0 else 0.0
-
-
-def face_qualities(
-    leftover: Leftover, sightings: Sequence[ZenithSighting], faces: np.ndarray
-) -> tuple[FaceQuality, ...]:
-    """Each face of a session against the others; faces (N,): number of each frame's face.
-
-    Empty for fewer than three faces: of two it is unknown which is wrong.
-    """
-    headings, qualities = np.degrees(mean_headings(sightings, faces)).tolist(), []
-    for number, heading_deg in enumerate(headings if len(headings) > 2 else ()):
-        member = faces == number
-        step, normal, chi2 = leftover.tested(leftover.by_lean * member[:, None, None])
-        known = np.linalg.cond(normal) < 1e9
-        stddev = np.sqrt(np.diag(np.linalg.inv(normal))) if known else np.full(2, np.nan)
-        qualities.append(
-            FaceQuality(
-                number=number,
-                heading_deg=heading_deg,
-                frames=int(member.sum()),
-                off_arcsec=step / ARCSEC,
-                stddev_arcsec=stddev / ARCSEC,
-                chi2=chi2,
-            )
-        )
-    return tuple(qualities)
 
 
 STEPS = 8
@@ -145,9 +91,12 @@ class DeflectionSession:
     catalogue_factor: size of the catalogue's errors over what it states, by the session's own stars.
     inclinometer: the errors that were assumed.
     as_stated: the session with the errors of the tiltmeter's file, where the residuals show larger ones.  same_air:
-    likewise, with the air of this adjustment.  gain: twice the log of the likelihood minus the one of same_air.
+    likewise, with the air of this adjustment.  cost: -2 log of the likelihood.
     chi2_per_degree: of the residuals; 1 where the stated errors and the air's explain them.
-    face_quality: each face against the others.  stars (S,): rows of the catalogue.
+    stars (S,): rows of the catalogue.
+    lines: the equations of the last step, before which the estimate was off the prior's by offset (5,).
+    by_second (N, 2): derivatives of the readings by a second of the clock, rad.
+    projector (2 N, 2 N), weighted (2 N,): weights that the unknowns leave, and the weighted residuals.
 
     Examples
     --------
@@ -169,13 +118,16 @@ class DeflectionSession:
     air: Air
     catalogue_factor: float
     chi2_per_degree: float
-    face_quality: tuple[FaceQuality, ...]
     stars: np.ndarray
-    leftover: Leftover
     inclinometer: InclinometerErrors
+    cost: float
+    lines: Lines
+    offset: np.ndarray
+    by_second: np.ndarray
+    projector: np.ndarray
+    weighted: np.ndarray
     as_stated: "DeflectionSession | None" = None
     same_air: "DeflectionSession | None" = None
-    gain: float = 0.0
 
     @property
     def mid_unix_s(self) -> float:
@@ -202,6 +154,47 @@ class DeflectionSession:
     def misalignment_deg(self) -> tuple[float, ...]:
         """A3 as three angles, as instrument files have them."""
         return Calibration().turned_to(self.a3).misalignment_deg
+
+    @property
+    def gain(self) -> float:
+        """Twice the log of the likelihood minus the one of same_air; 0 without that."""
+        return 0.0 if self.same_air is None else self.same_air.cost - self.cost
+
+    def tested(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """The best multiple (m,) of further columns (N, 2, m), its normal matrix, and by how much chi-square falls."""
+        flat = columns.reshape(-1, columns.shape[2])
+        normal = flat.T @ self.projector @ flat
+        right = flat.T @ self.weighted
+        step = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
+        return step, normal, float(step @ right)
+
+    def excess(self, covariance: np.ndarray) -> float:
+        """How many sigma more of an error of this covariance (2 N, 2 N) the residuals have than the weights assume."""
+        weighted = self.projector @ covariance
+        more = self.weighted @ covariance @ self.weighted - np.trace(weighted)
+        spread = np.sqrt(2 * np.sum(weighted * weighted.T))
+        return float(more / spread) if spread > 0 else 0.0
+
+    @cached_property
+    def face_quality(self) -> tuple[FaceQuality, ...]:
+        """Each face against the others; empty for fewer than three: of two it is unknown which is wrong."""
+        headings, qualities = np.degrees(mean_headings(self.sightings, self.faces)).tolist(), []
+        for number, heading_deg in enumerate(headings if len(headings) > 2 else ()):
+            member = self.faces == number
+            step, normal, chi2 = self.tested(self.lines.by_lean * member[:, None, None])
+            known = np.linalg.cond(normal) < 1e9
+            stddev = np.sqrt(np.diag(np.linalg.inv(normal))) if known else np.full(2, np.nan)
+            qualities.append(
+                FaceQuality(
+                    number=number,
+                    heading_deg=heading_deg,
+                    frames=int(member.sum()),
+                    off_arcsec=step / ARCSEC,
+                    stddev_arcsec=stddev / ARCSEC,
+                    chi2=chi2,
+                )
+            )
+        return tuple(qualities)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -239,19 +232,6 @@ def adjusted(
         ) from None
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Solved:
-    """A session's unknowns; offset (5,): how far the estimate was from the prior's before the last step, `fit`."""
-
-    estimate: LeanEstimate
-    lines: Lines
-    errors: dict[str, np.ndarray]
-    fit: _Fit
-    air: Air
-    offset: np.ndarray
-    inclinometer: InclinometerErrors
-
-
 class _Session:
     """What is given: sightings, as seen and with the stars' places that they adjusted, and what is known before.
 
@@ -276,23 +256,18 @@ class _Session:
         """The session with the errors of the tiltmeter as stated, or larger ones where the residuals show them."""
         stated = self.solved(self.inclinometer, None)
         if (shown := self.shown(stated)) is None:
-            return self.answer(stated)
+            return stated
         larger, size = shown
         # under one air: what is wrong with the tiltmeter had seemed to be the air's
-        more, less = self.solved(larger, size), self.solved(self.inclinometer, size)
-        return replace(
-            self.answer(more),
-            as_stated=self.answer(stated),
-            same_air=self.answer(less),
-            gain=less.fit.cost - more.fit.cost,
-        )
+        same_air = self.solved(self.inclinometer, size)
+        return replace(self.solved(larger, size), as_stated=stated, same_air=same_air)
 
     def errors(self, lines: Lines, inclinometer: InclinometerErrors) -> dict[str, np.ndarray]:
         since = self.given.utc_unix_s
         return errors_of(lines, self.sightings, self.places, self.faces, inclinometer, self.mark, since)
 
-    def solved(self, inclinometer: InclinometerErrors, air: Air | None) -> _Solved:
-        """The unknowns with a tiltmeter of these errors; air: its size, else the residuals determine it."""
+    def solved(self, inclinometer: InclinometerErrors, air: Air | None) -> DeflectionSession:
+        """The session with a tiltmeter of these errors; air: its size, else the residuals determine it."""
         known = not self.given.unknown
         estimate = LeanEstimate(lean=np.zeros(2), a3=self.given.a3) if known else start_of(self.sightings)
         offset, size = np.zeros(5), air
@@ -316,25 +291,18 @@ class _Session:
                 "arcsec): check the site, and the order and the signs of the tiltmeter's axes"
             )
         assert size is not None
-        return _Solved(
-            estimate=estimate,
-            lines=lines,
-            errors=errors,
-            fit=fit,
-            air=size,
-            offset=before,
-            inclinometer=inclinometer,
-        )
+        return self.answer(estimate, lines, errors, fit, size, before, inclinometer)
 
-    def shown(self, stated: _Solved) -> tuple[InclinometerErrors, Air] | None:
+    def shown(self, stated: DeflectionSession) -> tuple[InclinometerErrors, Air] | None:
         """The tiltmeter's errors and the air as the residuals show them; None: as stated, or hardly more."""
-        given, lines = stated.inclinometer, stated.lines
-        leftover, units, base = self.leftover(stated), {}, _stated(stated.errors)
+        given, lines, units = stated.inclinometer, stated.lines, {}
+        errors = self.errors(lines, given)
+        base = _stated(errors)
         for field, source, _ in SHOWN:
             unit = self.errors(lines, _larger(given, {field: 1.0}))[source]
-            if leftover.excess(unit) > SHOWN_SIGMA:
+            if stated.excess(unit) > SHOWN_SIGMA:
                 units[field] = unit
-                base = base - stated.errors[source]
+                base = base - errors[source]
         if not units:
             return None
         motion = max(stated.air.motion, 2 * MIN_RAD)
@@ -342,7 +310,7 @@ class _Session:
         begin = np.array([np.log(motion / MOTION_RAD), slow, *np.zeros(len(units))])
         simplex = begin + np.vstack([np.zeros(len(begin)), np.diag([-0.5, 0.7, *np.full(len(units), 1.5)])])
         sizes, gain = self.likeliest(
-            lines, stated.errors, base, tuple(units.values()), stated.offset, simplex, 0.02, 200
+            lines, errors, base, tuple(units.values()), stated.offset, simplex, 0.02, 200
         )
         if gain < SHOWN_GAIN:
             return None
@@ -397,26 +365,20 @@ class _Session:
         gain = inverse @ solve_triangular(root, white, lower=True, trans=1).T
         return _Fit(step=step, covariance=inverse, gain=gain, root=root, cost=cost, chi2=chi2)
 
-    def leftover(self, solved: _Solved) -> Leftover:
+    def answer(
+        self,
+        estimate: LeanEstimate,
+        lines: Lines,
+        errors: dict[str, np.ndarray],
+        fit: _Fit,
+        air: Air,
+        offset: np.ndarray,
+        inclinometer: InclinometerErrors,
+    ) -> DeflectionSession:
+        """The session as it is solved, with its errors by source."""
         # slow to import
         from scipy.linalg import cho_solve
 
-        fit, lines = solved.fit, solved.lines
-        parameters = lines.by_parameters.reshape(-1, 5)
-        inverse = cho_solve((fit.root, True), np.eye(len(parameters)))
-        design = inverse @ parameters
-        return Leftover(
-            by_lean=lines.by_lean,
-            by_second=lines.by_sky @ (self.mark.axes[:, 2] * ROTATION_RAD_S),
-            projector=inverse - design @ fit.covariance @ design.T,
-            weighted=inverse @ (lines.off.reshape(-1) - parameters @ fit.step),
-        )
-
-    def answer(self, solved: _Solved) -> DeflectionSession:
-        """The session as it is solved, with its errors by source."""
-        estimate, lines, errors, fit, air = (
-            solved.estimate, solved.lines, solved.errors, solved.fit, solved.air,
-        )  # fmt: skip
         size2 = {MOTION: air.motion**2, ANOMALOUS: air.anomalous**2}
         sources = {name: size2.get(name, 1.0) * covariance for name, covariance in errors.items()}
         gain = fit.gain[:2] / ARCSEC
@@ -426,14 +388,16 @@ class _Session:
         by_source = {name: term for name, term in by_source.items() if term.any()}
         # the rest, without what rounding leaves of it
         by_source["A3 as given"] = (axes * np.maximum(values, 0.0)) @ axes.T
-        left = (lines.off.reshape(-1) - lines.by_parameters.reshape(-1, 5) @ fit.step).reshape(-1, 2)
+        parameters = lines.by_parameters.reshape(-1, 5)
+        left = lines.off.reshape(-1) - parameters @ fit.step
+        inverse = cho_solve((fit.root, True), np.eye(len(parameters)))
+        design = inverse @ parameters
         back = np.linalg.inv(lines.by_lean)
         own = sources["tilt readings"] + sources["centroids"] + sources[MOTION]
         n = len(self.sightings)
         own = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
         per_frame = np.einsum("nab,nbc,ndc->nad", back, own, back)
         xi, eta = (estimate.deflection(self.mark.latitude) / ARCSEC).tolist()
-        leftover = self.leftover(solved)
         return DeflectionSession(
             sightings=self.seen,
             xi_arcsec=xi,
@@ -442,15 +406,19 @@ class _Session:
             by_source=by_source,
             a3=estimate.a3,
             faces=self.faces,
-            frame_arcsec=np.einsum("nab,nb->na", back, left) / ARCSEC,
+            frame_arcsec=np.einsum("nab,nb->na", back, left.reshape(-1, 2)) / ARCSEC,
             frame_stddev_arcsec=np.sqrt(np.diagonal(per_frame, axis1=1, axis2=2)) / ARCSEC,
             air=air,
             catalogue_factor=self.places.factor,
             chi2_per_degree=fit.chi2 / max(left.size - 5, 1),
-            face_quality=face_qualities(leftover, self.sightings, self.faces),
             stars=self.places.stars,
-            leftover=leftover,
-            inclinometer=solved.inclinometer,
+            inclinometer=inclinometer,
+            cost=fit.cost,
+            lines=lines,
+            offset=offset,
+            by_second=lines.by_sky @ (self.mark.axes[:, 2] * ROTATION_RAD_S),
+            projector=inverse - design @ fit.covariance @ design.T,
+            weighted=inverse @ left,
         )
 
 
@@ -501,24 +469,11 @@ def _sigma(covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Reduced:
-    """A deflection's reductions, arcsec: xi, eta each.
+def reduced(found: DeflectionSession, mark: Place) -> dict[str, np.ndarray]:
+    """A deflection's reductions, xi and eta each in arcsec.
 
-    tide_arcsec (2,): what Moon and Sun added, on the mean of the session.
-    curvature_arcsec: what the normal plumb line's curvature between geoid and mark added to xi.
-    mark_arcsec, geoid_arcsec (2,): the deflection without the tide, at the mark and at the geoid.
-    """
-
-    tide_arcsec: np.ndarray
-    curvature_arcsec: float
-    mark_arcsec: np.ndarray
-    geoid_arcsec: np.ndarray
-
-
-def reduced(found: DeflectionSession, mark: Place) -> Reduced:
-    """The reductions of a session.
-
+    tide_arcsec: what Moon and Sun added, on the mean of the session.  curvature_arcsec: what the normal plumb line's
+    curvature between geoid and mark added.  mark_arcsec, geoid_arcsec: without the tide, at the mark and at the geoid.
     The mark's height above the ellipsoid stands for that above the geoid: 50 m between them are 0.009 arcsec at most.
     What mountains add to the curvature no formula of the latitude has.
     """
@@ -529,11 +484,11 @@ def reduced(found: DeflectionSession, mark: Place) -> Reduced:
     tides = np.array([plumb_tide(middle, place, mark.axes) for middle in middles.tolist()])
     east, north = number @ tides / number.sum() / ARCSEC
     tide = np.array([north, east])
-    curvature = plumb_curvature_arcsec_per_m(mark.latitude) * mark.height_m
+    curvature = np.array([plumb_curvature_arcsec_per_m(mark.latitude) * mark.height_m, 0.0])
     at_mark = np.array([found.xi_arcsec, found.eta_arcsec]) - tide
-    return Reduced(
-        tide_arcsec=tide,
-        curvature_arcsec=float(curvature),
-        mark_arcsec=at_mark,
-        geoid_arcsec=at_mark - [curvature, 0.0],
-    )
+    return {
+        "tide_arcsec": tide,
+        "curvature_arcsec": curvature,
+        "mark_arcsec": at_mark,
+        "geoid_arcsec": at_mark - curvature,
+    }

@@ -120,19 +120,18 @@ def _worse(found: DeflectionSession) -> list[str]:
     if found.as_stated is None:
         return []
     stated, shown = found.as_stated.inclinometer, found.inclinometer
-    fields = (
+    said = []
+    for name, field, unit in (
         ("tilt_drift_arcsec_per_sqrt_hour", "drift_rad_per_sqrt_hour", ARCSEC),
         ("tilt_scale", "scale", 1.0),
-    )
-    sizes = [
-        (name, getattr(stated, field) / unit, getattr(shown, field) / unit) for name, field, unit in fields
-    ]
-    return [
-        f"the tiltmeter shows a {name} of {more:.2g}, its file states {less:.2g}: the errors hold what it "
-        "shows; state that, or calibrate it"
-        for name, less, more in sizes
-        if more > 1.01 * less
-    ]
+    ):
+        less, more = (getattr(errors, field) / unit for errors in (stated, shown))
+        if more > 1.01 * less:
+            said.append(
+                f"the tiltmeter shows a {name} of {more:.2g}, its file states {less:.2g}: the errors hold what it "
+                "shows; state that, or calibrate it"
+            )
+    return said
 
 
 def _zones_arcsec(found: DeflectionSession) -> float:
@@ -155,7 +154,7 @@ def _off(found: DeflectionSession) -> str:
 
 def _clock(found: DeflectionSession) -> tuple[float, str]:
     """Chi-square of the likeliest jump of the clock, and the sentence about it."""
-    step, chi2, at = _steps(found, found.leftover.by_second[..., None])
+    step, chi2, at = _steps(found, found.by_second[..., None])
     when = utc_text(found.sightings[at].utc_unix_s)
     return chi2, (
         f"the clock that stamps the frames seems to have jumped by {step[0]:+.3f} s before {when}: use the frames "
@@ -193,7 +192,7 @@ def _face_off(face: FaceQuality) -> str:
 def _steps(found: DeflectionSession, columns: np.ndarray) -> tuple[np.ndarray, float, int]:
     """The likeliest jump (m,) along columns (N, 2, m), its chi-square, and the frame from which on it holds."""
     late = np.arange(len(columns))
-    every = [found.leftover.tested(columns * (late >= k)[:, None, None]) for k in late[1:]]
+    every = [found.tested(columns * (late >= k)[:, None, None]) for k in late[1:]]
     at = int(np.argmax([chi2 for _, _, chi2 in every]))
     step, _, chi2 = every[at]
     return step, chi2, at + 1

@@ -16,8 +16,8 @@ from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S, EarthOrientation, EarthState, later, station_velocity
 from starpos.earth.place import Place
 from starpos.errors import FixError, InstrumentError
+from starpos.fix._adjustment import gain_of, spread
 from starpos.fix.attitude import CAMERA, ENU, Attitude
-from starpos.fix.budget import StarErrors
 from starpos.fix.sighting import Sighting
 from starpos.fix.solver import ENOUGH_SOUND, Solver
 from starpos.fix.star_fit import (
@@ -131,8 +131,8 @@ def sighting(
     kept, residual = fit.kept, fit.residual[fit.kept]
     placed_px = matched.place_sigma[kept] * camera.fx
     centroids = centroids_of(residual, matched.covariance_px2[kept], placed_px, share_free(fit.keep))
-    errors = StarErrors.of(fit.slope[kept], centroids, np.zeros_like(centroids), ())
-    if not np.isfinite(errors.gain).all():
+    gain = gain_of(np.ascontiguousarray(fit.slope[kept]), np.ascontiguousarray(centroids))
+    if not np.isfinite(gain).all():
         raise FixError(
             f"{stars.place}: its {len(residual)} stars do not determine the attitude: more are needed"
         )
@@ -142,7 +142,7 @@ def sighting(
     across = np.array([rotation.cross_matrix(ray) for ray in rays])
     icrs_to_camera = fit.a4 @ mark.axes @ state.gcrs_to_itrs
     displaced_px = turns @ across @ icrs_to_camera * matched.place_sigma[kept, None, None]
-    gain, white = errors.gain, np.linalg.inv(np.linalg.cholesky(centroids))
+    white = np.linalg.inv(np.linalg.cholesky(centroids))
     shown = white @ displaced_px
     common = np.linalg.qr((white @ fit.slope[kept]).reshape(-1, 4))[0].reshape(-1, 2, 4)
     stronger = solver.atmosphere.refraction(1 + STRONGER).bend(enu)[kept] - refraction.bend(enu)[kept]
@@ -153,7 +153,7 @@ def sighting(
     return ZenithSighting(
         source=stars.source,
         utc_unix_s=state.utc_unix_s,
-        camera=site_attitude(fit.a4, errors.rotation_covariance(centroids)),
+        camera=site_attitude(fit.a4, spread(gain, centroids)),
         stars=index[kept],
         by_star=np.einsum("ing,ngj->inj", gain, displaced_px),
         star_weight=np.einsum("ngi,ngj->nij", shown, shown),
@@ -255,12 +255,9 @@ class StarPlaces:
     def applied(self, sightings: Sequence[ZenithSighting]) -> list[ZenithSighting]:
         """The sightings with the attitudes that the corrected places give."""
         return [
-            s.turned(rotation.from_vector(-self._turn(k, s)))
-            for k, s in zip(self.rows, sightings, strict=True)
+            s.turned(rotation.from_vector(-np.einsum("inj,nj->i", s.by_star, self.correction[rows])))
+            for rows, s in zip(self.rows, sightings, strict=True)
         ]
-
-    def _turn(self, rows: np.ndarray, s: ZenithSighting) -> np.ndarray:
-        return np.einsum("inj,nj->i", s.by_star, self.correction[rows])
 
     def columns(self, by_camera: np.ndarray, sightings: Sequence[ZenithSighting]) -> np.ndarray:
         """Errors of 1 sigma (N, 2, 3 S) of the readings, by what remains unknown of the places.

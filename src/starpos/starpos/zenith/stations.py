@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy import special
 
 from starpos.earth.geoid import Geoid
 from starpos.earth.place import Place
@@ -160,10 +161,7 @@ class Station:
     @property
     def probability(self) -> float:
         """Probability that its sessions differ by as much, by chance; 1 of a single one."""
-        # slow to import
-        from scipy.stats import chi2
-
-        return float(chi2.sf(self.chi2, self.degrees)) if self.degrees else 1.0
+        return float(special.chdtrc(self.degrees, self.chi2)) if self.degrees else 1.0
 
     @property
     def doubt(self) -> str:

@@ -11,7 +11,7 @@ import pytest
 from cli_calls import WIDE
 
 from starpos import cli
-from starpos.cli import COMMANDS, console, inputs, parser_for
+from starpos.cli import COMMANDS, console, inputs, parser_for, run_of
 from starpos.cli.commands import command_of
 from starpos.fix import blind
 from starpos.frames import exif
@@ -181,7 +181,7 @@ def test_every_example_in_help_is_a_call_that_is_understood(name, example, capsy
         # of --help the parser itself makes the end
         if program and "--help" not in words:
             assert program == "starpos" and words[0] in COMMANDS
-            assert parser_for(words).parse_args(words).run
+            assert callable(run_of(parser_for(words).parse_args(words)))
     _, out, _ = run(capsys, name, "--help")
     assert f"  {example}\n" in out and command_of(name).next_step in out
 

@@ -21,7 +21,7 @@ def beacons_seen(xy, directions, utc_unix_s) -> Sighting:
     """The sighting of beacons at xy (N, 2) px in directions (N, 3): east, north, up by the plumb line."""
     stated = np.tile(SIGMA_PX**2 * np.eye(2), (len(xy), 1, 1))
     seen = fit_seen(xy, stated, CAMERA_PX, directions @ PLACE.plumb_axes)
-    to_camera, errors = seen.fit.a4, seen.errors.rotation_covariance(seen.errors.centroids)
+    to_camera, errors = seen.fit.a4, seen.own
     camera = Attitude(to_camera.T, to_camera.T @ errors @ to_camera, of=CAMERA, into=ITRS)
     return Sighting(utc_unix_s=utc_unix_s, camera=camera)
 

@@ -24,7 +24,7 @@ from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
-from starpos.navigation.sightings import PlacelessFrame, body_attitude
+from starpos.navigation.sightings import body_attitude
 from starpos.navigation.vessel import Vessel
 from starpos.session.driver import Level, Now
 from starpos_testing.voyages import INDUSTRIAL, made
@@ -281,9 +281,7 @@ def test_a_heading_at_a_known_place_claims_what_it_errs_by_when_the_mount_is_kno
     truth = zip(record.latitude, record.longitude, record.body_to_itrs, strict=True)
     for frame, (latitude, longitude, body_to_itrs) in zip(record.frames, truth, strict=True):
         place = Place.by_gravity(*np.degrees([latitude, longitude]), Deflection(0.0, 0.0, 0.0))
-        seen = frame.placeless()
-        placeless = PlacelessFrame(utc_unix_s=frame.utc_unix_s, stamp_stddev_s=0.0, camera=seen)
-        found = body_attitude(placeless, place, there)
+        found = body_attitude(frame, place, there)
         off = rotation.to_small_vector(found.rotation @ (enu_axes(latitude, longitude) @ body_to_itrs).T)
         nees.append(off @ np.linalg.solve(found.covariance, off))
     # three degrees of freedom; 60 frames

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from voyage_calls import navigated, nees, sigma_m, vessel
+from voyage_calls import navigated, nees, sigma_m
 
 from starpos.navigation.chain import Chain, smoothed
 from starpos.navigation.equations import CONSTANTS, MEASURED, VELOCITY, Residuals, StarAttitudes
@@ -129,11 +129,6 @@ def test_standstills_are_some_of_them_by_a_mask():
     both = Standstills(first=np.array([2, 9]), last=np.array([4, 9]))
     assert both.nodes.tolist() == [2, 3, 4, 9] and both.middle.tolist() == [3, 9]
     assert both.but(np.array([False, True])).nodes.tolist() == [9]
-
-
-@pytest.mark.parametrize("vehicle", ["ship", "drone", "parked", None])
-def test_only_a_rover_is_taken_to_stand(vehicle):
-    assert vessel("rover").halts and not vessel(vehicle).halts
 
 
 def driven(drive, seed=3, noisier=1.0):

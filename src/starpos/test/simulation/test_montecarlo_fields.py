@@ -107,14 +107,14 @@ def test_answers_are_counted(catalogue, conditions):
     assert len(tally.cpu_ms) == 5
 
 
-def test_wilson():
+def test_the_interval_is_wilsons():
     """Newcombe 1998, Statistics in Medicine 17, 857, table I: 81 of 263, 15 of 148, 0 of 20, 1 of 29."""
     for (r, n), interval in {
         (81, 263): (0.2553, 0.3662), (15, 148): (0.0624, 0.1605), (0, 20): (0.0, 0.1611), (1, 29): (0.0061, 0.1718),
     }.items():  # fmt: skip
-        assert mc.wilson(r, n) == pytest.approx(interval, abs=1e-4)
-    assert mc.wilson(20, 20)[1] == pytest.approx(1)
-    assert mc.wilson(0, 0) == (0, 1)
+        assert mc.Tally(correct=r, wrong=n - r).interval == pytest.approx(interval, abs=1e-4)
+    assert mc.Tally(correct=20).interval[1] == pytest.approx(1)
+    assert mc.Tally().interval == (0, 1)
 
 
 def test_the_command(capsys):

@@ -105,7 +105,7 @@ def tilts_at(scene: Scene, times_s, rng) -> list[msg.Tilt]:
     covariance = np.eye(2) * np.radians(NOISE_DEG) ** 2
     return [
         tilt_to_message(
-            Tilt(*read_tilt(scene, 0.0, rng), covariance, utc_unix_s=float(t), temperature_c=TEMPERATURE_C),
+            Tilt(*read_tilt(scene, rng), covariance, utc_unix_s=float(t), temperature_c=TEMPERATURE_C),
             "starpos_inclinometer_frame",
             j,
         )

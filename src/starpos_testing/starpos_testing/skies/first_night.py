@@ -76,7 +76,7 @@ def arriving(
                 for t in np.arange(now_s, now_s + waits_s, TILT_S):
                     # no readings while it is moved
                     if waits_s == CADENCE_S or t > now_s + MOVED_S - CADENCE_S:
-                        x, y = np.degrees(read_tilt(at, (t - begin_s) / 3600, rng))
+                        x, y = np.degrees(read_tilt(at, rng))
                         tilts.write(f"{t:.3f},{x:.6f},{-y if mirrored else y:.6f}\n")
                 tilts.flush()
                 now_s += waits_s

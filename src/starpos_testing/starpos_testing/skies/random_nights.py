@@ -233,7 +233,7 @@ def photograph(
             shaky = replace(scene, tilt_errors=replace(scene.tilt_errors, zero=tuple(off)))
             for k in range(READINGS):
                 moment = now + (k + 0.5) * EXPOSURE_S / READINGS + world.clock_s
-                rows.append((moment, *read_tilt(shaky, 0.0, rng), 15.0 + warm))
+                rows.append((moment, *read_tilt(shaky, rng), 15.0 + warm))
             now += CADENCE_S
         now += TURN_S
     return stars, np.array(rows), scene.heading

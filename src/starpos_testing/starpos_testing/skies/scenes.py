@@ -33,7 +33,7 @@ def stars_of(scene, catalogue, rng, start=START) -> Stars:
 def tilt_of(scene, rng, start=START) -> Tilt:
     """One reading with its stated error."""
     sigma = max(scene.tilt_errors.noise, np.radians(1e-6))
-    return Tilt(*read_tilt(scene, 0.0, rng), np.eye(2) * sigma**2, utc_unix_s=start + EXPOSURE / 2)
+    return Tilt(*read_tilt(scene, rng), np.eye(2) * sigma**2, utc_unix_s=start + EXPOSURE / 2)
 
 
 def solver_of(scene, catalogue, **more) -> Solver:
