@@ -217,6 +217,9 @@ TEACHING_PIXELS = 12000
 UNLIKE, DARKEST = 0.005, 1e-9
 # Rounds in which each star's own shape is measured, and in each of them rounds of centring.
 OWN_ROUNDS, CENTRINGS = 3, 2
+# Rounds in which one window is fitted to all, from this sigma (px) where none has a shape; the least squared width (px2)
+# of an image through it.
+COMMON_ROUNDS, FIRST_SIGMA, THINNEST = 4, 1.5, 0.1
 # Number of stars that agree by more than chance, and their maximum difference (log of width, ellipticity); twigs differ.
 ALIKE, LIKENESS = 5, 0.6
 # Rounds of fitting and refining the PSF, and the order of its terms.
@@ -384,9 +387,19 @@ def _typical_shape(light: np.ndarray, blur: float, many: bool) -> tuple[np.ndarr
         if np.count_nonzero(near & (values[:, 0] > NARROWEST)) <= 0.5 * len(light):
             densest = np.argmin(spatial.cKDTree(look[sound]).query(look[sound], ALIKE)[0][:, -1])
             alike = sound & (np.linalg.norm(look - look[sound][densest], axis=1) < LIKENESS)
-    if not (sound & alike).any():
-        return None, alike
-    typical = np.median(shape[sound & alike], axis=0)[None]
+    typical, middle = np.eye(2)[None] * FIRST_SIGMA**2, np.full(len(light), reach)
+    if (sound & alike).any():
+        typical = np.median(shape[sound & alike], axis=0)[None]
+    # faint stars' own windows follow their noise: once more through one window of the shape that all have
+    for _ in range(COMMON_ROUNDS):
+        window = window_for(typical)
+        x, y = centroid(light, middle, middle, typical)
+        seen = window_moments(light, -x, -y, window)[2]
+        usable = alike & (squared_widths(seen)[:, 0] > THINNEST)
+        if not usable.any():
+            return None, alike
+        over = np.linalg.inv(np.median(seen[usable], axis=0)) - np.linalg.inv(window)
+        typical = clip_widths(over, 1 / widest, 1 / NARROWEST, -1.0)
     return clip_widths(typical - blur * np.eye(2), NARROWEST, np.inf, 1.0), alike
 
 
