@@ -39,7 +39,7 @@ def came(graph, attitudes, shot) -> Attitude:
 def nees(message, shot) -> float:
     """Squared error under the shot's sky in units of the claim: chi-squared of three degrees of freedom."""
     enu = enu_axes(*np.radians([LATITUDE_DEG, LONGITUDE_DEG]))
-    seen = PlacelessFrame.of(message_to_attitude(message)).under(enu[2], AIR)
+    seen, _ = PlacelessFrame.of(message_to_attitude(message)).under(enu[2], AIR)
     off = Rotation.from_matrix(seen.rotation.T @ enu.T @ shot.scene.attitude).as_rotvec()
     # `off` is about the axes of the camera
     return float(off @ np.linalg.solve(seen.covariance_about_own, off))

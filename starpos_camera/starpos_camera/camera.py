@@ -27,6 +27,7 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
 from starpos.messages.camera import message_to_camera
 from starpos.parameters.table import parameters_of
+from starpos.session.driver import Changes
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource, NothingYet, SourceEnded
 from starpos_camera.sources.timing import OF_SYSTEM_CLOCK, ShutterTimes, in_one_time
@@ -97,7 +98,7 @@ class CameraNode(Node):
         self._ended = False
         self._state = (Level.WARN, "no frame has been taken yet.")
         self._said_s = -math.inf
-        self._logged = ""
+        self._log = Changes(self.get_logger())
         self._images = publisher(self, Image, "~/image_raw", IMAGE_DEPTH)
         self._infos = publisher(self, CameraInfo, "~/camera_info", 10, latched=True)
         self._captures = publisher(self, Capture, "~/capture", 10)
@@ -249,14 +250,7 @@ class CameraNode(Node):
     def _say(self, level: Level, sentence: str) -> None:
         """Set the state; log it if it differs from the last logged one."""
         self._state, self._said_s = (level, sentence), time.monotonic()
-        if sentence == self._logged:
-            return
-        self._logged = sentence
-        # rclpy ties a severity to the calling line, so each severity has its own line.
-        if level is Level.OK:
-            self.get_logger().info(sentence)
-        else:
-            self.get_logger().warning(sentence)
+        self._log.say(sentence, level is Level.OK)
 
     def _on_set_camera_info(
         self, request: SetCameraInfo.Request, response: SetCameraInfo.Response
@@ -296,15 +290,11 @@ class CameraNode(Node):
     ) -> SetCapture.Response:
         wanted = {"gain": request.gain, "exposure": request.exposure, "cadence": request.cadence}
         # 0 means unset for an exposure and a cadence, and for a gain if none is set now.
-        unset = [
-            name for name, value in wanted.items() if math.isnan(value) or (value == 0 and name != "gain")
-        ]
-        if wanted["gain"] == 0 and math.isnan(self._values["gain"]):
-            unset.append("gain")
+        zero_is_set = [] if math.isnan(self._values["gain"]) else ["gain"]
         changes = [
             rclpy.parameter.Parameter(name, value=value)
             for name, value in wanted.items()
-            if name not in unset
+            if not math.isnan(value) and (value != 0 or name in zero_is_set)
         ]
         refusal = ""
         # rclpy refuses an empty list of changes.

@@ -31,6 +31,7 @@ from starpos.messages.camera import (
 )
 from starpos.messages.stamp import stamp_to_unix
 from starpos.parameters.table import parameters_of
+from starpos.session.driver import Changes
 from starpos.session.pace import MAX_LATE_S, Pace
 from starpos_camera.after_solution import Annotator, TrailFinder
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, Troubles, time_is_simulated
@@ -228,8 +229,7 @@ class DetectorNode(Node):
         # What was wrong with a frame since the last report.
         self._complaint = ""
         self._last: DetectedFrame | None = None
-        # Size of the last frame, in words.
-        self._size = ""
+        self._sizes = Changes(self.get_logger())
         # In monotonic time.
         self._last_frame_s: float | None = None
         self._interval_s: float | None = None
@@ -382,7 +382,8 @@ class DetectorNode(Node):
                 self._frames += 1
                 self._troubles.right("frames")
                 if result.frame is not None:
-                    self._say_size(result.frame)
+                    width, height = result.frame.width, result.frame.height
+                    self._sizes.say(f"frames of {width} x {height} px, {encoding_of(result.frame)}.", True)
                     if self._day is not None:
                         self._day.judge(result.frame, result.detection.stars.disc)
                     subject = result.frame, result.detection.stars, result.message.header
@@ -397,12 +398,6 @@ class DetectorNode(Node):
                 kind = type(result).__name__
                 self._complain(f"a frame was given up ({kind}: {result}); keep it and report this.")
         self._go_on()
-
-    def _say_size(self, frame: Frame) -> None:
-        size = f"{frame.width} x {frame.height} px, {encoding_of(frame)}"
-        if size != self._size:
-            self._size = size
-            self.get_logger().info(f"frames of {size}.")
 
     def _complain(self, sentence: str) -> None:
         self._bad += 1

@@ -16,18 +16,19 @@ import numpy as np
 import pytest
 from attempts import attempt, in_thread, made
 
+from starpos.frames.encodings import ENCODINGS
+from starpos.frames.frame import Frame
 from starpos_camera.sources import aravis as source_module
 from starpos_camera.sources.aravis import (
     FORMATS,
     AravisCamera,
-    FrameTimes,
     best_format,
     clock_relation,
     library,
-    pixels_of,
+    on_host_clock,
     stamp_of_camera,
 )
-from starpos_camera.sources.source import CaptureError, CaptureSettings
+from starpos_camera.sources.source import CaptureError, CaptureSettings, decoded
 from starpos_interfaces.msg import Capture
 from starpos_testing.lacking import lacks
 
@@ -155,21 +156,21 @@ def test_a_trigger_that_never_comes_is_said_and_the_node_ends_at_once(make, monk
 def test_an_incomplete_frame_is_refused(make, monkeypatch):
     source = make()
     source.capture(SHORT)
-    monkeypatch.setattr(source._device, "_bits", 8)
+    monkeypatch.setattr(source._device, "_encoding", "mono8")
     assert "a frame has 524288 bytes instead of 262144" in attempt(source, SHORT)
     monkeypatch.undo()
     source.capture(SHORT)
 
 
 def test_formats_become_pixels_row_by_row():
-    for name, (pattern, bits) in FORMATS.items():
-        assert (pattern == "") == name.startswith("Mono")
-        assert name.endswith(str(bits))
+    for name, (encoding, bits) in FORMATS.items():
+        assert name.endswith(str(bits)) and encoding.endswith("8" if bits == 8 else "16")
+        assert ENCODINGS[encoding].pattern[:2].upper() == name.rstrip("0123456789")[5:]
     twelve = np.arange(6, dtype="<u2").reshape(2, 3) + 4000
-    assert np.array_equal(pixels_of(twelve.tobytes(), (3, 2), 12), twelve)
-    assert np.array_equal(pixels_of(bytes(range(6)), (3, 2), 8), [[0, 1, 2], [3, 4, 5]])
+    assert np.array_equal(decoded(FORMATS["Mono12"][0], twelve.tobytes(), (3, 2))[0], twelve)
+    assert np.array_equal(decoded(FORMATS["Mono8"][0], bytes(range(6)), (3, 2))[0], [[0, 1, 2], [3, 4, 5]])
     with pytest.raises(CaptureError, match="11 bytes instead of 12"):
-        pixels_of(twelve.tobytes()[:-1], (3, 2), 12)
+        decoded(FORMATS["Mono12"][0], twelve.tobytes()[:-1], (3, 2))
 
 
 def test_the_deepest_format_is_taken_and_of_a_colour_sensor_its_mosaic():
@@ -182,56 +183,54 @@ def test_the_deepest_format_is_taken_and_of_a_colour_sensor_its_mosaic():
         best_format(["Mono12p", "RGB8"], "RGB8")
 
 
-def taken(**changes):
-    given = {
-        "exposure_s": 0.5,
-        "commanded_s": 1000.0,
-        "received_s": 1000.6,
-        "camera_s": 20.01,
-        "relation": (980.0, 1e-4),
-    }
-    return FrameTimes(**given | changes)
+# The camera's time of a frame by the node's clock, and its error.
+AT = (1000.01, 1e-4)
+
+
+def dated(at=AT, commanded_s=1000.0, received_s=1000.6, moment="unknown"):
+    frame = Frame(np.zeros((8, 8), np.uint8))
+    return stamp_of_camera(frame, at, 0.5, commanded_s, received_s, values(timestamp=moment))
 
 
 @pytest.mark.parametrize(
-    ("changes", "moment", "middle_s", "source"),
+    ("given", "middle_s", "source"),
     [
         # Start or end of the exposure: only one fits between trigger and arrival.
-        ({}, "unknown", 1000.26, Capture.HARDWARE),
-        ({"camera_s": 20.55}, "unknown", 1000.30, Capture.HARDWARE),
-        ({}, "start", 1000.26, Capture.HARDWARE),
+        ({}, 1000.26, Capture.HARDWARE),
+        ({"at": (1000.55, 1e-4)}, 1000.30, Capture.HARDWARE),
+        ({"moment": "start"}, 1000.26, Capture.HARDWARE),
         # Both fit, if a frame comes late.
-        ({"camera_s": 20.55, "received_s": 1001.1}, "unknown", 1000.55, Capture.HARDWARE),
-        ({"camera_s": 20.55, "received_s": 1001.1}, "start", 1000.80, Capture.HARDWARE),
+        ({"at": (1000.55, 1e-4), "received_s": 1001.1}, 1000.55, Capture.HARDWARE),
+        ({"at": (1000.55, 1e-4), "received_s": 1001.1, "moment": "start"}, 1000.80, Capture.HARDWARE),
         # Impossible stated values, and impossible exposures.
-        ({}, "end", 1000.25, Capture.COMMAND),
-        ({"camera_s": 19.0}, "unknown", 1000.25, Capture.COMMAND),
-        ({"camera_s": 21.0}, "unknown", 1000.25, Capture.COMMAND),
-        # A clock that cannot be read may keep UTC.
-        ({"relation": None, "camera_s": 1000.01}, "unknown", 1000.26, Capture.HARDWARE),
-        ({"relation": None}, "unknown", 1000.25, Capture.COMMAND),
-        ({"camera_s": None}, "unknown", 1000.25, Capture.COMMAND),
+        ({"moment": "end"}, 1000.25, Capture.COMMAND),
+        ({"at": (999.0, 1e-4)}, 1000.25, Capture.COMMAND),
+        ({"at": (1001.0, 1e-4)}, 1000.25, Capture.COMMAND),
+        ({"at": None}, 1000.25, Capture.COMMAND),
         # A line has triggered.
-        ({"commanded_s": None, "camera_s": 20.55}, "unknown", 1000.30, Capture.HARDWARE),
-        ({"commanded_s": None, "camera_s": None}, "unknown", 1000.35, Capture.DRIVER),
-        ({"commanded_s": None, "relation": None, "camera_s": 1000.55}, "end", 1000.35, Capture.DRIVER),
+        ({"commanded_s": None, "at": (1000.55, 1e-4)}, 1000.30, Capture.HARDWARE),
+        ({"commanded_s": None, "at": None}, 1000.35, Capture.DRIVER),
     ],
 )
-def test_the_stamp_is_the_middle_wherever_the_cameras_time_is_of(changes, moment, middle_s, source):
-    stamp = stamp_of_camera(taken(**changes), moment, values())
-    assert stamp.source == source
-    assert stamp.mid_s == pytest.approx(middle_s, abs=1e-9)
+def test_the_stamp_is_the_middle_wherever_the_cameras_time_is_of(given, middle_s, source):
+    taken = dated(**given)
+    assert taken.stamp_source == source
+    assert taken.frame.mid_unix_s == pytest.approx(middle_s, abs=1e-9)
 
 
 def test_the_stamps_error_holds_what_is_not_known():
-    sure = stamp_of_camera(taken(), "unknown", values())
-    assert sure.stddev_s == pytest.approx(np.hypot(1e-3, 1e-4))
-    either = stamp_of_camera(taken(camera_s=20.55, received_s=1001.1), "unknown", values())
+    assert dated().frame.stamp_stddev_s == pytest.approx(np.hypot(1e-3, 1e-4))
+    either = dated(at=(1000.55, 1e-4), received_s=1001.1)
     # At 0.25 s from one or the other.
-    assert either.stddev_s == pytest.approx(0.25, rel=1e-3)
-    utc = stamp_of_camera(taken(relation=None, camera_s=1000.01), "unknown", values())
-    assert utc.stddev_s == pytest.approx(np.hypot(0.1 / np.sqrt(3), 1e-3))
-    assert "contradict" in stamp_of_camera(taken(), "end", values()).remark
+    assert either.frame.stamp_stddev_s == pytest.approx(0.25, rel=1e-3)
+    assert "contradict" in dated(moment="end").remark
+
+
+def test_a_clock_that_cannot_be_read_may_keep_utc():
+    assert on_host_clock(20.01, (980.0, 1e-4), 0.5, 1000.0, 1000.6) == AT
+    assert on_host_clock(1000.01, None, 0.5, 1000.0, 1000.6) == pytest.approx((1000.01, 0.1 / np.sqrt(3)))
+    assert on_host_clock(20.01, None, 0.5, 1000.0, 1000.6) is None
+    assert on_host_clock(1000.55, None, 0.5, None, 1000.6) is None
 
 
 class Clock:

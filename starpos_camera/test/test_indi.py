@@ -119,7 +119,7 @@ def test_what_another_client_has_set_does_not_stay(source, other):
     other.tell("Number", "CCD_FRAME", X=10, Y=20, WIDTH=300, HEIGHT=200)
     device = source._device
     # All that was set before is there.
-    assert device.until(lambda: device.number("CCD_FRAME", "X") == 10, WAIT_S)
+    assert device.until(lambda: device.vector("CCD_FRAME").number("X") == 10, WAIT_S)
     assert source.capture(SHORT).frame.pixels.shape == SIZE
     source.update(values("indi", indi__binning=2))
     assert source.capture(SHORT).frame.pixels.shape == (SIZE[0] // 2, SIZE[1] // 2)

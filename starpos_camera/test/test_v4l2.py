@@ -151,7 +151,7 @@ def test_a_camera_that_gives_nothing_is_given_up_in_time(session, monkeypatch):
 
 def test_a_jpeg_is_whole_or_none():
     picture = np.add.outer(np.arange(48), 3 * np.arange(64)).astype(np.uint8)
-    data = np.append(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 100])[1], np.zeros(9, np.uint8))
+    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes() + bytes(9)
     assert abs(_from_jpeg(cv2, data, 64, 48).astype(int) - picture).max() <= 3
     for broken, size in ((data[:-500], (64, 48)), (data[:0], (64, 48)), (data, (48, 64))):
         with pytest.raises(CaptureError, match="no whole JPEG"):

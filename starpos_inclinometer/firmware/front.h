@@ -24,16 +24,15 @@
 // From the window's tick to the middle of the burst, and the time that setting up takes.
 extern const uint8_t front_half_burst_ms;
 extern const uint16_t front_setup_ms;
+extern const uint8_t front_readings; // of X, and of Y, in a burst
+// Of the readings of a sample, as codes: 24 bits, offset binary. Meaningless once a burst ends with NO_ANSWER.
+extern uint32_t front_sums[2];
 
-void front_init(void);                   // interrupts and pins; the SPI bus is there
-void front_begin_setup(uint32_t now);
+void front_begin_setup(uint32_t now);    // the SPI bus is there
 void front_poll(uint32_t now);
 bool front_pending(void);                // poll has something to do now
-void front_begin_sample(void);
 void front_begin_burst(void);
 uint8_t front_end_burst(uint32_t now);   // at the window's end; status bits
 void front_abandon(void);                // the burst under way
 bool front_idle(void);                   // it is set up, and a burst may begin at once
-uint8_t front_end_sample(uint32_t now, uint8_t bursts, uint8_t status); // status bits to add; the codes are renewed
-uint32_t front_code(uint8_t axis);       // 24 bits, offset binary, of the last good sample
 bool front_temperature(uint8_t *counts); // the T field; false where it means nothing

@@ -52,7 +52,6 @@
 #define COUNTS_AT_M40C 240 // 197 + 1.083 x 40
 
 #define CONVERSIONS 4
-#define PER_CHANNEL (CONVERSIONS / 2)
 #define TRANSFERS_US 250 // reading a conversion and starting the next one, measured
 #define BEGIN_US 250     // from the tick to the first conversion, measured
 #define BURST_US (CONVERSIONS * (AD7730_SETTLING_PERIODS * AD7730_PERIOD_NS / 1000 + TRANSFERS_US))
@@ -64,6 +63,7 @@ _Static_assert(BEGIN_US + BURST_US + SPARE_US < WINDOW_MS * 1000UL, "a burst mus
 
 const uint8_t front_half_burst_ms = (BEGIN_US + BURST_US / 2 + 500) / 1000;
 const uint16_t front_setup_ms = SETUP_MS;
+const uint8_t front_readings = CONVERSIONS / 2;
 
 static const uint8_t CHANNELS[CONVERSIONS] = {0, 1, 1, 0};
 static const uint16_t CONVERT[] = {
@@ -87,8 +87,6 @@ static bool reference_was_lost; // the calibration is not to be trusted
 
 static bool converted; // this burst
 static bool without_reference;
-static uint32_t sums[2];
-static uint32_t codes[2] = {CODE_ZERO, CODE_ZERO};
 
 // POL high: mode 3; 1 MHz, at most 5 MHz (pulses of 100 ns each).
 #define AD7730_CONTROL (SPI_MODE_3 | SPI_BY_8)
@@ -149,14 +147,10 @@ static bool runs(uint16_t mode)
     return read(AD7730_MODE, 2) == (mode | AD7730_MODE_INPUT);
 }
 
-void front_init(void)
+void front_begin_setup(uint32_t now)
 {
     MCUCR |= _BV(ISC01); // INT0 at the falling edge of RDY
     GICR |= _BV(INT0);
-}
-
-void front_begin_setup(uint32_t now)
-{
     reset();
     setup_began = now;
     phase = RESETTING;
@@ -175,11 +169,6 @@ static void convert(void)
 {
     start(CONVERT[CHANNELS[step]]);
     phase = CONVERTING;
-}
-
-void front_begin_sample(void)
-{
-    sums[0] = sums[1] = 0;
 }
 
 void front_begin_burst(void)
@@ -201,7 +190,7 @@ static void on_ready(uint32_t now)
             return;
         }
     } else {
-        sums[CHANNELS[step]] += read(AD7730_DATA, 3);
+        front_sums[CHANNELS[step]] += read(AD7730_DATA, 3);
         // Had a spike put the interface out of step, or reset the part, the codes would be anything.
         if (!runs(CONVERT[CHANNELS[step]])) {
             front_begin_setup(now);
@@ -233,8 +222,12 @@ uint8_t front_end_burst(uint32_t now)
 {
     uint8_t status = without_reference ? MEANINGLESS : 0;
     without_reference = false;
-    if (converted)
-        return status;
+    if (converted) {
+        if (!reference_was_lost || status)
+            return status;
+        front_begin_setup(now);
+        return MEANINGLESS; // converted with a calibration without reference
+    }
     if (phase == CONVERTING || (phase != IDLE && now - setup_began >= SETUP_MS))
         front_begin_setup(now);
     return status | NO_ANSWER;
@@ -249,24 +242,6 @@ void front_abandon(void)
 bool front_idle(void)
 {
     return phase == IDLE || phase == CONVERTING;
-}
-
-uint8_t front_end_sample(uint32_t now, uint8_t bursts, uint8_t status)
-{
-    if (!(status & NO_ANSWER)) {
-        uint8_t count = PER_CHANNEL * bursts;
-        for (uint8_t i = 0; i < 2; i++)
-            codes[i] = (sums[i] + count / 2) / count;
-    }
-    if (!reference_was_lost || (status & MEANINGLESS))
-        return 0;
-    front_begin_setup(now);
-    return MEANINGLESS; // converted with a calibration without reference
-}
-
-uint32_t front_code(uint8_t axis)
-{
-    return codes[axis];
 }
 
 // Between two commands CSB must be high for 150 us; they are a sample, at least 20 ms, apart.

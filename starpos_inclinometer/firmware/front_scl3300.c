@@ -44,16 +44,15 @@ enum scl3300_answer {
 #define TEMPERATURE_SHIFT 4
 #define TEMPERATURE_ZERO 256 // T = TEMP / 16 - 256, for -40 to 125 deg C: 19 to 214
 
-const uint8_t front_half_burst_ms = 1; // 0.5 ms of transfers, begun 0.2 ms after the tick
+const uint8_t front_half_burst_ms = 0; // both angles are read within 0.5 ms of the tick, measured
 const uint16_t front_setup_ms = SETUP_MS;
+const uint8_t front_readings = 1;
 
 static enum { POWERING, RESETTING, SETTLING, RUNNING } phase;
 static uint32_t phase_began;
 static bool begun; // a burst; measured by the next poll
 
 static uint8_t burst_status;
-static int32_t sums[2];
-static uint32_t codes[2] = {CODE_ZERO, CODE_ZERO};
 static uint16_t temperature;
 
 // Mode 0; 2 MHz, 2 to 4 MHz are recommended.
@@ -100,10 +99,6 @@ static void enter(uint8_t next, uint32_t now)
     phase_began = now;
 }
 
-void front_init(void)
-{
-}
-
 void front_begin_setup(uint32_t now)
 {
     enter(POWERING, now);
@@ -118,11 +113,6 @@ static bool is_well(void)
     scl3300_frame(SCL3300_READ(SCL3300_STATUS), &answer);
     scl3300_frame(SCL3300_READ(SCL3300_WHOAMI), &answer);
     return scl3300_frame(SCL3300_READ(SCL3300_STATUS), &answer) == SCL3300_GOOD && answer == SCL3300_IDENTITY;
-}
-
-void front_begin_sample(void)
-{
-    sums[0] = sums[1] = 0;
 }
 
 // The elevation of an axis: an angle beyond 90 deg has that of its supplement.
@@ -160,7 +150,7 @@ static uint8_t measure(void)
     if (elevation(answers[Z]) < 0)
         status |= UPSIDE_DOWN;
     for (uint8_t i = 0; i < 2; i++)
-        sums[i] += elevation(answers[i]);
+        front_sums[i] += CODE_ZERO + (int32_t)elevation(answers[i]) * CODE_PER_ANGLE;
     temperature = answers[TEMPERATURE];
     return status;
 }
@@ -212,21 +202,6 @@ void front_abandon(void)
 bool front_idle(void)
 {
     return phase == RUNNING;
-}
-
-uint8_t front_end_sample(uint32_t now, uint8_t bursts, uint8_t status)
-{
-    (void)now;
-    if (!(status & NO_ANSWER)) {
-        for (uint8_t i = 0; i < 2; i++)
-            codes[i] = CODE_ZERO + sums[i] * CODE_PER_ANGLE / bursts;
-    }
-    return 0;
-}
-
-uint32_t front_code(uint8_t axis)
-{
-    return codes[axis];
 }
 
 bool front_temperature(uint8_t *counts)

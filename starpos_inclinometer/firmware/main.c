@@ -96,7 +96,6 @@ int main(void)
     clock_init();
     uart_init();
     spi_init();
-    front_init();
     pulses_init();
     set_sleep_mode(SLEEP_MODE_IDLE);
     sampler_init(after_watchdog);

@@ -19,6 +19,8 @@ static bool sampling;
 static uint32_t began;
 static uint8_t burst;
 static uint8_t status = FIRST;
+uint32_t front_sums[2];
+static uint32_t codes[2] = {CODE_ZERO, CODE_ZERO}; // of the last good sample
 
 static uint8_t bursts(void)
 {
@@ -41,7 +43,7 @@ static void begin_sample(uint32_t now)
     began = now;
     burst = 0;
     sampling = true;
-    front_begin_sample();
+    front_sums[0] = front_sums[1] = 0;
     front_begin_burst();
 }
 
@@ -54,6 +56,9 @@ static bool end_burst(uint32_t now)
         return false;
     }
     sampling = false;
+    uint8_t count = front_readings * bursts();
+    for (uint8_t i = 0; i < 2 && !(status & NO_ANSWER); i++)
+        codes[i] = (front_sums[i] + count / 2) / count;
     return true;
 }
 
@@ -65,8 +70,8 @@ static void send(uint32_t middle)
     frame_begin('T');
     frame_field(sequence++, 2);
     frame_field(middle, 4);
-    frame_field(front_code(0), 3);
-    frame_field(front_code(1), 3);
+    frame_field(codes[0], 3);
+    frame_field(codes[1], 3);
     frame_field(temperature, 1);
     frame_field(status, 1);
     status = frame_send() ? 0 : OVERRUN;
@@ -86,8 +91,6 @@ void sampler_poll(void)
     front_poll(now);
     bool complete = sampling && now - began >= (uint16_t)WINDOW_MS * (burst + 1) && end_burst(now);
     uint32_t middle = began + middle_ms();
-    if (complete)
-        status |= front_end_sample(now, bursts(), status);
     if ((int32_t)(now - due) >= 0)
         begin_sample(now); // before the line, so that its burst begins at the tick
     if (complete)

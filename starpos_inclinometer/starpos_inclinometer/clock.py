@@ -4,14 +4,16 @@
 The time of a sample comes from the device's milliseconds, free of the jitter of the serial line and of the scheduler. A
 line can come late but never early. So the lower envelope of (arrival - MCU time) over a window relates the two clocks,
 and whatever lies above it is delay. The envelope is a straight line with a slope, because the rates of the clocks
-differ. It is the edge of the lower hull at the middle of the window: the linear-programming fit of Moon, Skelly and
-Towsley (1999).
+differ. Of all lines below the points it is the highest at the middle of the window: the linear-programming fit of Moon,
+Skelly and Towsley (1999).
 """
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
+
+import numpy as np
 
 from starpos.system_clock import StepWatch
 
@@ -96,6 +98,7 @@ MIN_SPAN_S = 10.0
 REFIT_S = 1.0
 # More than the error of an RC oscillator, let alone of a crystal.
 MAX_RATE_ERROR = 0.05
+RATE_RESOLUTION = 1e-9
 # If a sample is further ahead of the envelope, the MCU's clock has jumped.
 EARLY_S = 0.2
 # A sample further behind comes from a backlog, or the MCU's clock stood still.
@@ -238,15 +241,16 @@ class ArrivalFilter:
         self._live, self._backlog, self._new = False, False, (0.0, arrival_s)
 
     def _fit(self) -> None:
-        points = self._points
-        first, last = points[0][0], points[-1][0]
+        times, offsets = np.array(self._points).T
+        first, last = times[0], times[-1]
         if last - first >= MIN_SPAN_S:
-            hull = _lower_hull(points)
-            middle = (first + last) / 2
-            index = next(i for i in range(1, len(hull)) if hull[i][0] >= middle)
-            (t0, o0), (t1, o1) = hull[index - 1], hull[index]
-            self._slope = min(max((o1 - o0) / (t1 - t0), -MAX_RATE_ERROR), MAX_RATE_ERROR)
-        self._level = min(offset - self._slope * time for time, offset in points)
+            low, high = -MAX_RATE_ERROR, MAX_RATE_ERROR
+            while high - low > RATE_RESOLUTION:
+                self._slope = (low + high) / 2
+                # A line that is lowered to touch the points touches on the side to which it has to turn.
+                touches = times[np.argmin(offsets - self._slope * times)]
+                low, high = (self._slope, high) if 2 * touches < first + last else (low, self._slope)
+        self._level = float((offsets - self._slope * times).min())
 
 
 class PaceWatch:
@@ -285,20 +289,3 @@ class PaceWatch:
         self._spacings.extend(self._doubtful)
         self._doubtful, self._due_s = None, arrival_s
         return True
-
-
-def _lower_hull(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Find the lower convex hull of points in the order of time (Andrew's monotone chain)."""
-    hull: list[tuple[float, float]] = []
-    for t, o in points:
-        if hull and t == hull[-1][0]:
-            if o >= hull[-1][1]:
-                continue
-            hull.pop()
-        while len(hull) > 1:
-            (t0, o0), (t1, o1) = hull[-2], hull[-1]
-            if (o1 - o0) * (t - t0) < (o - o0) * (t1 - t0):
-                break
-            hull.pop()
-        hull.append((t, o))
-    return hull

@@ -35,24 +35,17 @@ class Reporter:
         self._flags: Counter[str] = Counter()
         self._samples = 0
         self._counts = Counts()
-        # The flags that are already reported.
-        self._known = 0
 
-    def count(self, flags: int) -> bool:
-        """Count the flags of a sample; return whether one of them was not reported yet."""
+    def count(self, flags: int) -> None:
         self._samples += 1
         for name, bit in FLAGS.items():
             self._flags[name] += bool(flags & bit)
-        new = flags & (STUCK | SATURATED | OUT_OF_RANGE) & ~self._known
-        self._known |= new
-        return bool(new)
 
     def report(self, health: Health, now_s: float) -> Diagnosis:
         """Make the report of a source; now_s is monotonic."""
         counts, before, self._counts = health.counts, self._counts, health.counts
         flags, self._flags = self._flags, Counter()
         samples, self._samples = self._samples, 0
-        self._known = sum(bit for name, bit in FLAGS.items() if flags[name])
         good = counts.good - before.good
         bad = sum(
             getattr(counts, name) - getattr(before, name)
@@ -131,34 +124,22 @@ class InclinometerNode(Node):
     def _apply(self, names: frozenset[str]) -> None:
         self._source.configure(self._values)
 
-    def _publish_readings(self) -> bool:
-        """Publish what the source has; return whether one has a flag that was not reported yet."""
-        urgent = False
+    def _on_wake(self) -> None:
         for reading in self._source.fetch():
             self._publisher.publish(self._message(reading))
-            urgent |= self._reporter.count(reading.flags)
+            self._reporter.count(reading.flags)
         for pulse in self._source.fetch_pulses():
             self._pulses.publish(pulse)
-        return urgent
-
-    def _on_wake(self) -> None:
-        urgent = self._publish_readings()
-        health = self._source.health()
-        urgent |= self._log(health)
-        if urgent:
+        if self._log(self._source.health()):
             self._diagnostics.publish()
 
     def _message(self, reading: Reading) -> Tilt:
-        message = Tilt()
+        message = Tilt(covariance=list(reading.covariance))
         message.header.stamp = Time(nanoseconds=reading.stamp_ns).to_msg()
         message.header.frame_id = self._values["frame_id"]
-        message.x = reading.x
-        message.y = reading.y
-        message.covariance = list(reading.covariance)
-        message.temperature = reading.temperature_c
-        message.sequence = reading.sequence
-        message.flags = reading.flags
-        message.z, message.z_variance = reading.z, reading.z_variance
+        # A reading has the message's names.
+        for name in ("x", "y", "z", "z_variance", "temperature", "sequence", "flags"):
+            setattr(message, name, getattr(reading, name))
         return message
 
     def _log(self, health: Health) -> bool:

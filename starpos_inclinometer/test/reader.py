@@ -5,11 +5,16 @@ import threading
 import time
 
 from starpos_inclinometer.clock import HostClock
-from starpos_inclinometer.sources.mcu import McuDecoder
+from starpos_inclinometer.sources.mcu import McuDecoder, McuSource
 from starpos_inclinometer.sources.mcu_protocol import BAUD
 from starpos_inclinometer.sources.serial_link import SerialLink
-from starpos_inclinometer.sources.source import Health
+from starpos_inclinometer.sources.source import Health, Surroundings
 from starpos_testing.patience import WAIT_S
+
+
+def mcu_source(values) -> McuSource:
+    """A source that converts what a test gives it, and reads no port."""
+    return McuSource(Surroundings(None, HostClock(), lambda: None), values)
 
 
 class Reader:
@@ -18,7 +23,8 @@ class Reader:
     def __init__(self, path, rate_hz=50, now_ns=time.time_ns):
         self.samples = []
         self.decoder = McuDecoder(rate_hz)
-        self.link = SerialLink(path, BAUD, self.decoder, HostClock(now_ns), self._wake)
+        host = Surroundings(None, HostClock(now_ns), self._wake)
+        self.link = SerialLink(host, {"port": path, "baud": BAUD}, self.decoder)
         self._event = threading.Condition()
         self.link.start()
 
@@ -28,7 +34,7 @@ class Reader:
 
     def _wake(self):
         with self._event:
-            self.samples += self.link.fetch()
+            self.samples += self.link.arrivals()
             self._event.notify_all()
 
     def wait(self, condition) -> Health:

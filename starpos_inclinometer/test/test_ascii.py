@@ -32,8 +32,9 @@ def values(**changed):
 class Feeder:
     """A decoder whose lines come 0.1 s apart."""
 
-    def __init__(self, pattern=PLAIN, unit="deg", **options):
-        self.decoder = LineDecoder(pattern, unit, **options)
+    def __init__(self, pattern=PLAIN, **changed):
+        given = {f"ascii.{name}": value for name, value in changed.items()}
+        self.decoder = LineDecoder(values(**{"ascii.pattern": pattern} | given))
         self.now_s = 100.0
 
     def send(self, *texts):
@@ -185,7 +186,7 @@ def test_a_million_bytes_of_anything_never_raise_and_are_never_believed():
         assert feeder.decoder.decode(noise, Moment(0.0, 0)) == []
     lines = [f"$TILT,{k},{100 * k},1.25{k % 10},-2.50{k % 7},21.5\r\n".encode() for k in range(20_000)]
     said = {(k, 100 * k, f"1.25{k % 10}", f"-2.50{k % 7}") for k in range(20_000)}
-    decoder, believed = LineDecoder(FULL, "deg"), 0
+    decoder, believed = Feeder(FULL).decoder, 0
     for k, line in enumerate(lines):
         # Something of the line is lost: the pattern knows where numbers begin, not where they end.
         if rng.random() < 0.1:

@@ -159,7 +159,7 @@ def test_millisecond_wrap_is_no_reset_but_going_back_is(cable):
     reset = [line(0, 10, status=SampleStatus.FIRST | SampleStatus.WATCHDOG), line(1, 110)]
     unannounced = [line(0, 5), line(1, 105)]
     got = cable.send(*first, *wrapped, *reset, identity(), *unannounced)
-    assert [s.restarted for s in got] == [False, False, False, True, False, True, False]
+    assert [s.broken for s in got] == [False, False, False, True, False, True, False]
     assert np.diff(numbers(got)).tolist() == [1] * 6
     assert (cable.counts.restarts, cable.counts.lost, cable.counts.implausible) == (2, 0, 0)
 
@@ -170,6 +170,6 @@ def test_the_first_sample_of_a_new_connection_claims_no_continuity(cable):
     cable.decoder.resume()
     assert cable.send(line(2)) == []
     got += cable.send(line(3))
-    assert [s.resumed for s in got] == [False, False, True, False]
+    assert [s.broken for s in got] == [False, False, True, False]
     assert numbers(got) == [0, 1, 2, 3]
     assert (cable.counts.lost, cable.counts.garbage_bytes) == (0, 9)

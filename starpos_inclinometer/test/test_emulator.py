@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from starpos.messages.tilt import OUT_OF_RANGE, SATURATED
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import Identity, LineParser, Reason, Refusal, SampleStatus
 from starpos_inclinometer.sources.tilts import Sca100t
@@ -21,7 +22,7 @@ COMMAND = [sys.executable, "-c", "import sys; from starpos_testing.emulator impo
 
 
 def readings(mcu, n):
-    sensor, parser = Sca100t(), LineParser()
+    sensor, parser = Sca100t(defaults_of("inclinometer")), LineParser()
     return [
         sensor.measure(s, s.milliseconds * 1e-3)
         for s in parser.parse(b"".join(mcu.sample() for _ in range(n)))

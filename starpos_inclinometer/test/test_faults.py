@@ -165,11 +165,11 @@ def test_microcontroller_reset(board, wire, read, tell):
     board.tell("hang")
     reader.wait(lambda state, samples: state.counts.restarts == 1)
     reader.wait(lambda state, samples: reader.identity.rate_hz == 50 and len(samples) >= n + 60)
-    first = next(k for k, a in enumerate(reader.samples) if a.sample.restarted)
+    first = next(k for k, a in enumerate(reader.samples) if a.sample.broken)
     before, after = (reader.samples[k].moment.monotonic_s for k in (first - 1, first))
     sequence = [a.sample.sequence for a in reader.samples]
     assert sequence == sorted(set(sequence))
-    assert [s for s in wrong(reader, wire) if not s.restarted and s.sequence < sequence[first]] == []
+    assert [s for s in wrong(reader, wire) if not s.broken and s.sequence < sequence[first]] == []
     assert {(a.sample.x, a.sample.y) for a in reader.samples} <= {(s.x, s.y) for s in wire.sent}
     state = reader.link.health()
     assert (state.values["openings"], state.counts.implausible, state.counts.lost) == (1, 0, 0)

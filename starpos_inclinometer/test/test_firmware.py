@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from board import ELF, FIRMWARE, SIM, Board
 
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import (
     Identity,
@@ -24,8 +25,10 @@ from starpos_inclinometer.sources.mcu_protocol import (
     Sample,
     SampleStatus,
 )
-from starpos_inclinometer.sources.tilts import DIVIDER, Sca100t
+from starpos_inclinometer.sources.tilts import Sca100t
 from starpos_testing.emulator import DEFAULT_RATE_HZ, Mcu
+
+VALUES = defaults_of("inclinometer")
 
 # Reset, calibration and a first sample.
 BOOT_MS = 1000
@@ -60,7 +63,7 @@ def samples(messages):
 
 def angles(messages):
     """deg, (n, 2)."""
-    sensor = Sca100t()
+    sensor = Sca100t(VALUES)
     return np.degrees([(r.x, r.y) for r in (sensor.measure(s, 0.0) for s in samples(messages))])
 
 
@@ -89,7 +92,7 @@ def test_wiring_table_and_divider_are_the_boards():
         (row,) = (line.split("|") for line in table if line.startswith(f"| {pin} "))
         assert signal in row[3 if chip == "AD7730" else 4]
     r1, r2 = (int(re.search(rf"#define DIVIDER_R{i}_OHM (\d+)UL", header)[1]) for i in (1, 2))
-    assert (r1 + r2) / r2 == DIVIDER
+    assert (r1 + r2) / r2 == VALUES["divider"]
 
 
 def test_says_who_it_is_before_the_first_sample(start):
@@ -178,7 +181,7 @@ def test_temperature(board, celsius):
     board.tell(f"temperature {celsius}")
     sample = samples(board.messages(BOOT_MS))[-1]
     assert sample.status == 0
-    assert Sca100t().measure(sample, 0.0).temperature_c == pytest.approx(celsius, abs=0.47)
+    assert Sca100t(VALUES).measure(sample, 0.0).temperature_c == pytest.approx(celsius, abs=0.47)
 
 
 def test_without_the_sensors_answer_it_says_so_and_sends_on(board):
@@ -265,7 +268,7 @@ def test_a_reset_in_the_middle_tells_its_cause(board, cause, status):
     messages = board.messages(2000)
     identity, first, *rest = messages[next(i for i, m in enumerate(messages) if isinstance(m, Identity)) :]
     assert identity.rate_hz == DEFAULT_RATE_HZ
-    assert first.status == status and first.restarted
+    assert first.status == status and first.broken
     assert {s.status for s in rest} == {0} and len(rest) >= 10
     assert first.milliseconds < 400
     parser = board.parser

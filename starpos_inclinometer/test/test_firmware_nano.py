@@ -13,6 +13,7 @@ import pytest
 from board import ELF, FIRMWARE, Board
 
 from starpos.messages.tilt import OUT_OF_RANGE, STUCK
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import Identity, Sample, SampleStatus, SensorKind
 from starpos_inclinometer.sources.tilts import Scl3300
@@ -36,7 +37,7 @@ def samples(messages):
 
 
 def readings(messages):
-    sensor = Scl3300()
+    sensor = Scl3300(defaults_of("inclinometer"))
     return [sensor.measure(s, 0.0) for s in samples(messages)]
 
 
@@ -72,7 +73,7 @@ def test_wiring_table_is_the_boards():
 def test_says_which_sensor_it_has_and_is_well_from_the_first_sample(board):
     first, *rest = board.messages(600)
     assert first == Identity(
-        version=2, firmware=0x0200, unit=0, rate_hz=DEFAULT_RATE_HZ, delay_ms=60, kind=SensorKind.SCL3300
+        version=2, firmware=0x0200, unit=0, rate_hz=DEFAULT_RATE_HZ, delay_ms=61, kind=SensorKind.SCL3300
     )
     assert [s.status for s in samples(rest)] == [SampleStatus.FIRST] + [0] * (len(rest) - 1)
     assert len(rest) >= 4 and board.tell("state")["sensor_resets"] == 1
@@ -177,13 +178,13 @@ def test_a_hung_mcu_is_reset_and_goes_on(board):
     board.messages(507)
     board.tell("hang")
     first = next(s for s in samples(board.messages(1500)) if s.status & SampleStatus.FIRST)
-    assert first.status == SampleStatus.FIRST | SampleStatus.WATCHDOG and first.restarted
+    assert first.status == SampleStatus.FIRST | SampleStatus.WATCHDOG and first.broken
     assert (board.parser.crc_errors, board.parser.malformed) == (0, 0)
 
 
 def test_the_claimed_noise_is_that_of_the_readings(board):
     at_rate(board, 50)
-    sensor = Scl3300()
+    sensor = Scl3300(defaults_of("inclinometer"))
     got = [sensor.measure(s, 0.02 * k) for k, s in enumerate(samples(board.messages(20_000)))]
     means = np.array([(r.x, r.y) for r in got[: len(got) // 50 * 50]]).reshape(-1, 50, 2).mean(1)
     claimed = math.sqrt(got[-1].covariance[0] / 50)

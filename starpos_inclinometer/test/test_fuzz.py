@@ -8,12 +8,13 @@ import tracemalloc
 
 import numpy as np
 from corrupted import IDENTITY, RATE_HZ, as_sent, lines
+from reader import mcu_source
 
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.ascii_line import LineDecoder
-from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
+from starpos_inclinometer.sources.mcu import McuDecoder
 
 VALUES = defaults_of("inclinometer")
 # Bytes of each kind.
@@ -25,7 +26,7 @@ class Host:
 
     def __init__(self):
         self.decoder = McuDecoder(RATE_HZ)
-        self.tilts = McuTilts(VALUES)
+        self.tilts = mcu_source(VALUES)
         self.samples = []
         self.now_s = 0.0
         self.take(IDENTITY)
@@ -152,7 +153,7 @@ def test_the_drivers_memory_does_not_grow():
 
 
 def test_the_ascii_decoders_memory_does_not_grow():
-    decoder = LineDecoder(VALUES["ascii.pattern"], "deg")
+    decoder = LineDecoder(VALUES)
     rng = random.Random(5)
 
     def feed(k):

@@ -12,7 +12,7 @@ from iio_tree import adxl355, plug, scl3300
 from starpos.messages.tilt import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock, Moment
-from starpos_inclinometer.sources.iio import IioLink, IioSource
+from starpos_inclinometer.sources.iio import IioSource
 from starpos_inclinometer.sources.iio_device import DeviceError, find, set_sampling_frequency
 from starpos_inclinometer.sources.source import Arrival, Phase, Surroundings
 from starpos_testing.patience import WAIT_S
@@ -174,13 +174,13 @@ def test_a_device_that_goes_and_comes_back_is_read_again(tmp_path):
     """Comes back under another number, as the kernel may give it; a half-written value is dropped."""
     scl3300(tmp_path)
     values = DEFAULTS | {"iio.root": str(tmp_path), "iio.device": "scl3300", "rate": 50}
-    link = IioLink(Surroundings(None, HostClock(), lambda: None), values)
+    link = IioSource(Surroundings(None, HostClock(), lambda: None), values)
     end_s = time.monotonic() + WAIT_S
 
     def wait(condition):
         while not condition():
             assert time.monotonic() < end_s, link.health()
-            link.fetch()
+            link.arrivals()
 
     link.start()
     try:

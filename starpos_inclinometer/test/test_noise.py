@@ -8,6 +8,7 @@ import pytest
 from board import Board
 
 from starpos.instrument.tilt_log import LONG_RUN, SHORT_RUN, NoiseTracker
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.tilts import Sca100t
 from starpos_testing.emulator import Mcu
@@ -29,7 +30,7 @@ def white(n, sigma=SIGMA, seed=1):
 
 def measured(samples):
     """(N, 2) tilts and (N, 2) 1 sigma of them, once the noise is known."""
-    sensor = Sca100t()
+    sensor = Sca100t(defaults_of("inclinometer"))
     got = [(sensor.measure(s, s.milliseconds * 1e-3), sensor.noise.sigma) for s in samples]
     known = [m for m, sigma in got if sigma is not None]
     return np.array([(m.x, m.y) for m in known]), np.sqrt([m.covariance[::3] for m in known])

@@ -6,11 +6,12 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 from board import Board
+from reader import mcu_source
 
 from starpos.parameters.table import defaults_of
 from starpos_common.shutter_pulses import Edge, ShutterPulse, ShutterPulses
 from starpos_inclinometer.clock import Moment
-from starpos_inclinometer.sources.mcu import LINE_STDDEV_S, SECOND_STDDEV_S, McuDecoder, McuTilts, PulseTimes
+from starpos_inclinometer.sources.mcu import LINE_STDDEV_S, SECOND_STDDEV_S, McuDecoder, PulseTimes
 from starpos_inclinometer.sources.mcu_protocol import Input, LineParser, Pulse, Sample, frame
 from starpos_testing import emulator
 
@@ -212,7 +213,7 @@ def test_the_numbers_of_edges_go_on_over_their_wrap_and_tell_of_lost_ones():
 def test_a_night_of_frames_has_the_times_of_their_light_though_nobody_stated_the_cameras_lag(board):
     """From the contact through board, line, driver and pairing: 0.1 ms are 5 cm of longitude, the lag's 0.3 s 139 m."""
     rng, exposure_s, off_s = np.random.default_rng(1), 0.3, 0.015
-    decoder, tilts, pairing = McuDecoder(10), McuTilts(VALUES), ShutterPulses()
+    decoder, tilts, pairing = McuDecoder(10), mcu_source(VALUES), ShutterPulses()
     board.run(BOOT_MS)
     # the first pulse of the receiver is the second 1.7e9
     zero_ms = board.tell("pps 100 1000")["ms"] + 100
@@ -249,7 +250,7 @@ def test_a_night_of_frames_has_the_times_of_their_light_though_nobody_stated_the
 
 def test_edges_go_through_the_driver_with_the_relation_that_the_samples_showed(board):
     """The board's own bytes, each read when it came; the edge's time is good to the lines' jitter."""
-    decoder, tilts = McuDecoder(10), McuTilts(VALUES)
+    decoder, tilts = McuDecoder(10), mcu_source(VALUES)
     got, told = [], []
     for k in range(40):
         if k == 25:

@@ -5,12 +5,13 @@ import math
 
 import numpy as np
 import pytest
+from reader import mcu_source
 
 from starpos.messages.tilt import GAP, OUT_OF_RANGE, SATURATED, STUCK
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import Moment, Step
 from starpos_inclinometer.node import Reporter
-from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
+from starpos_inclinometer.sources.mcu import McuDecoder
 from starpos_inclinometer.sources.mcu_protocol import Identity, Sample
 from starpos_inclinometer.sources.source import Arrival, Counts, Health, Phase
 from starpos_testing.emulator import Mcu
@@ -60,22 +61,6 @@ def test_each_report_counts_what_came_since_the_one_before():
     assert second.level == 0 and second.values["of these stuck"] == 0
 
 
-def test_a_flag_is_urgent_until_it_was_told():
-    reporter = Reporter()
-    assert [reporter.count(f) for f in (0, STUCK, STUCK, STUCK | SATURATED, GAP)] == [
-        False,
-        True,
-        False,
-        True,
-        False,
-    ]
-    reporter.report(health(), 0.0)
-    assert not reporter.count(STUCK)
-    reporter.report(health(), 1.0)
-    reporter.report(health(), 2.0)
-    assert reporter.count(STUCK)
-
-
 def arrival(k, at_s, identity=None, **more):
     sample = Sample(
         sequence=k,
@@ -94,7 +79,7 @@ def identity(rate_hz, delay_ms=14):
 
 
 def test_another_rate_is_another_noise():
-    tilts = McuTilts(VALUES)
+    tilts = mcu_source(VALUES)
     tilts.read([arrival(k, 0.02 * k, identity(50)) for k in range(500)])
     assert tilts.sensor.noise.sigma is not None
     tilts.read([arrival(500, 10.0, identity(50))])
@@ -109,7 +94,7 @@ def played(rates_hz, at_once):
     at_once: the samples are taken when all are there, not each as it comes.
     """
     mcu = Mcu(rate_hz=10, noise_rad=0.0035, seed=1)
-    decoder, tilts = McuDecoder(10), McuTilts(VALUES)
+    decoder, tilts = McuDecoder(10), mcu_source(VALUES)
     now_s, waiting, errors, arrivals = 0.0, mcu.reset(0.0), [], []
     for rate_hz in rates_hz:
         decoder.wanted_rate_hz = rate_hz
@@ -141,7 +126,7 @@ def test_a_change_of_rate_moves_no_stamp(at_once):
 
 def test_samples_before_the_microcontroller_has_said_its_rate_move_none_after():
     """It had another rate from before, and the sensor is unknown: they are left out, and the losses are counted."""
-    tilts = McuTilts(VALUES)
+    tilts = mcu_source(VALUES)
     assert tilts.read([arrival(k, 0.02 * k + 0.014, lost=k == 0) for k in range(5)]) == []
     later = tilts.read([arrival(k, 0.02 * k + 0.014, identity(50)) for k in range(5, 20)])
     line_s = 430 / 38400
@@ -151,17 +136,16 @@ def test_samples_before_the_microcontroller_has_said_its_rate_move_none_after():
     )
 
 
-@pytest.mark.parametrize("cause", ["restarted", "resumed"])
-def test_after_a_reset_or_a_new_connection_the_clocks_are_related_anew(cause):
+def test_after_a_reset_or_a_new_connection_the_clocks_are_related_anew():
     """The MCU's milliseconds go on by chance where they were, 1 s off: that is no lateness."""
-    tilts = McuTilts(VALUES)
+    tilts = mcu_source(VALUES)
     tilts.read([arrival(k, 0.02 * k, identity(50)) for k in range(500)])
-    (reading,) = tilts.read([arrival(500, 11.0, identity(50), **{cause: True})])
+    (reading,) = tilts.read([arrival(500, 11.0, identity(50), broken=True)])
     assert 11.0 - reading.stamp_ns * 1e-9 == pytest.approx(0.014 + 43 * 10 / 38400, abs=1e-6)
 
 
 def test_the_latency_is_the_devices_or_the_parameters():
     for latency, delay_ms, expected in ((math.nan, 14, 0.014), (math.nan, 9, 0.009), (0.1, 14, 0.1)):
-        tilts = McuTilts(VALUES | {"latency": latency})
+        tilts = mcu_source(VALUES | {"latency": latency})
         (reading,) = tilts.read([arrival(0, 5.0, identity(50, delay_ms))])
         assert 5.0 - reading.stamp_ns * 1e-9 == pytest.approx(expected + 430 / 38400, abs=1e-6)

@@ -7,14 +7,22 @@ import numpy as np
 import pytest
 
 from starpos.messages.tilt import GAP, OUT_OF_RANGE, SATURATED, STUCK
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.sources import tilts
 from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
-from starpos_inclinometer.sources.tilts import SQUARE_AXES, Sca100t, Sca100tCalibration
+from starpos_inclinometer.sources.tilts import SQUARE_AXES, Sca100t
 from starpos_testing.emulator import code_of, temperature_counts
 
+DEFAULTS = defaults_of("inclinometer")
 
-def sensor(*calibration, **settings):
-    made = Sca100t(*calibration)
+
+def calibration(**changes):
+    """Parameters of the node; in the names of the changed ones __ stands for a dot."""
+    return DEFAULTS | {name.replace("__", "."): value for name, value in changes.items()}
+
+
+def sensor(values=DEFAULTS, **settings):
+    made = Sca100t(values)
     for name, value in settings.items():
         setattr(made, name, value)
     return made
@@ -30,7 +38,7 @@ def sample(x=0x800000, y=0x800000, temperature=175, status=0, **more):
 
 def test_codes_by_hand():
     """31 x 80 mV = 2.48 V of the sensor's output is half the range; 30 deg is 2 V, 2 / 2.48 of it."""
-    c = Sca100tCalibration()
+    c = sensor()
     assert c.volts(0x800000) == 2.5
     assert c.volts(0) == pytest.approx(0.02, abs=1e-12)
     assert code_of(4.5) == 0x800000 + round(2.0 / 2.48 * 2**23)
@@ -41,9 +49,7 @@ def test_codes_by_hand():
 
 
 def test_offset_sensitivity_divider_and_reference_of_each_axis():
-    c = Sca100tCalibration(
-        offset_volts=(2.4, 2.6), sensitivity_volts_per_g=(3.9, 4.1), divider=40.0, reference_volts=5.2
-    )
+    c = calibration(offset_volts=[2.4, 2.6], sensitivity=[3.9, 4.1], divider=40.0, reference_volts=5.2)
     reading = measure(sample(*(code_of(v, 40.0, 5.2) for v in (2.4 + 3.9 * 0.1, 2.6 - 4.1 * 0.2))), c)
     assert math.sin(reading.x) == pytest.approx(0.1, abs=1e-6)
     assert math.sin(reading.y) == pytest.approx(-0.2, abs=1e-6)
@@ -76,14 +82,14 @@ def test_the_noise_parameter_is_a_floor_that_the_samples_may_rise_above():
 def turned(gx, gy, c, at=20.0, cross_axis=SQUARE_AXES):
     """The codes of what an instrument with the calibration's own errors feels."""
     g = np.linalg.solve(np.array(cross_axis).reshape(2, 2), [gx, gy])
-    pairs = (c.offset_and_sensitivity(axis, at) for axis in range(2))
+    pairs = (sensor(c).offset_and_sensitivity(axis, at) for axis in range(2))
     return [
         code_of(offset + sensitivity * share) for (offset, sensitivity), share in zip(pairs, g, strict=True)
     ]
 
 
 def test_cross_axis_matrix_and_its_covariance():
-    c, matrix = Sca100tCalibration(), (0.99, 0.05, -0.03, 1.01)
+    c, matrix = DEFAULTS, (0.99, 0.05, -0.03, 1.01)
     gx, gy = math.sin(math.radians(12)), math.sin(math.radians(-20))
     reading = measure(sample(*turned(gx, gy, c, cross_axis=matrix)), cross_axis=matrix)
     assert np.degrees([reading.x, reading.y]) == pytest.approx([12, -20], abs=1e-5)
@@ -95,17 +101,19 @@ def test_cross_axis_matrix_and_its_covariance():
         moved = measure(sample(x + jump * (k == 0), y + jump * (k == 1)), cross_axis=matrix)
         slopes.append([(moved.x - reading.x), (moved.y - reading.y)])
     raw = np.linalg.solve(np.array(matrix).reshape(2, 2), [gx, gy])
-    sigma_code = math.radians(0.0035) * np.sqrt(1 - raw**2) / (c.volts_per_code / 4.0)
+    sigma_code = math.radians(0.0035) * np.sqrt(1 - raw**2) / (sensor(c).volts_per_code / 4.0)
     jacobian = np.array(slopes).T / jump * sigma_code
     expected = jacobian @ jacobian.T
     assert np.array(reading.covariance).reshape(2, 2) == pytest.approx(expected, rel=0.01)
     assert abs(expected[0, 1]) > 0.01 * expected[0, 0]
 
 
-WARM = Sca100tCalibration(
-    temperature_reference_c=25.0,
-    offset_per_c=((5e-4, -2e-6, 1e-8), (-3e-4, 1e-6, 0.0)),
-    sensitivity_per_c=((1e-4, 1e-6, 0.0), (-2e-4, 0.0, 1e-8)),
+WARM = calibration(
+    temperature__reference=25.0,
+    temperature__offset_x=[5e-4, -2e-6, 1e-8],
+    temperature__offset_y=[-3e-4, 1e-6, 0.0],
+    temperature__sensitivity_x=[1e-4, 1e-6, 0.0],
+    temperature__sensitivity_y=[-2e-4, 0.0, 1e-8],
 )
 
 
@@ -117,7 +125,7 @@ def test_temperature_polynomials(celsius):
         2.5 - 3e-4 * t + 1e-6 * t**2 + 4.0 * (1 - 2e-4 * t + 1e-8 * t**3) * -0.2,
     )
     counts = temperature_counts(celsius)
-    s = Sca100t(WARM)
+    s = sensor(WARM)
     reading = s.measure(sample(*map(code_of, volts), temperature=counts), 0.0)
     # one count is 0.92 deg C, of which the offset of x makes 0.007 deg
     error = np.abs(np.sin([reading.x, reading.y]) - [0.1, -0.2])
@@ -127,7 +135,7 @@ def test_temperature_polynomials(celsius):
 
 
 def test_one_count_of_temperature_comes_slowly_and_a_missing_one_changes_nothing_but_the_error():
-    s = Sca100t(WARM)
+    s = sensor(WARM)
     x, y = turned(0.1, -0.2, WARM)
     first = s.measure(sample(x, y, temperature=175), 0.0)
     stepped = s.measure(sample(x, y, temperature=174), 0.1)
@@ -144,11 +152,13 @@ def test_one_count_of_temperature_comes_slowly_and_a_missing_one_changes_nothing
 
 
 def offset_x(linear, square):
-    return Sca100tCalibration(offset_per_c=((linear, square, 0.0), (0.0, 0.0, 0.0)))
+    return calibration(temperature__offset_x=[linear, square, 0.0])
 
 
 def test_a_polynomial_far_outside_of_its_range_does_not_turn_an_axis_round():
-    c = Sca100tCalibration(sensitivity_per_c=((-0.01, 0.0, 0.0), (-0.01, -1e-4, 0.0)))
+    c = calibration(
+        temperature__sensitivity_x=[-0.01, 0.0, 0.0], temperature__sensitivity_y=[-0.01, -1e-4, 0.0]
+    )
     counts = temperature_counts(125.0)
     reading = measure(sample(x=0x880000, y=0x780000, temperature=counts), c)
     assert reading.x > 0 > reading.y and np.isfinite(reading.covariance).all()
@@ -158,7 +168,7 @@ def test_a_polynomial_far_outside_of_its_range_does_not_turn_an_axis_round():
     "odd", [{"lost": 1}, {"status": SampleStatus.NO_ANSWER}, {"x": 0}, {"x": code_of(4.9)}]
 )
 def test_what_is_flagged_tells_no_noise(odd):
-    s = Sca100t()
+    s = sensor()
     for k in range(100):
         s.measure(sample(**({"x": 0x800000 + 37 * k % 101, "y": 0x800000 + k} | odd)), 0.1 * k)
     assert s.noise.sigma is None
@@ -187,11 +197,12 @@ def test_a_temperature_never_known_widens_the_error_by_all_it_may_be():
         (sample(y=0), OUT_OF_RANGE | SATURATED),
         (sample(y=0xFFFFFF), OUT_OF_RANGE | SATURATED),
         (sample(lost=3), GAP),
-        (sample(restarted=True), GAP),
-        (sample(resumed=True), GAP),
+        (sample(broken=True), GAP),
         (sample(status=SampleStatus.NO_ANSWER), STUCK),
         (sample(status=SampleStatus.MEANINGLESS), STUCK),
-        (sample(status=SampleStatus.OVERRUN | 0xC0), 0),
+        (sample(status=SampleStatus.OVERRUN), 0),
+        (sample(status=SampleStatus.SELF_TEST), STUCK),
+        (sample(status=SampleStatus.UPSIDE_DOWN), OUT_OF_RANGE),
     ],
 )
 def test_flags(what, flags):
@@ -201,13 +212,13 @@ def test_flags(what, flags):
 
 
 def test_angles_stay_finite_where_there_is_none():
-    reading = measure(sample(x=0, y=0xFFFFFF), Sca100tCalibration(sensitivity_volts_per_g=(1.0, 1.0)))
+    reading = measure(sample(x=0, y=0xFFFFFF), calibration(sensitivity=[1.0, 1.0]))
     assert (reading.x, reading.y) == pytest.approx((-math.pi / 2, math.pi / 2))
     assert reading.flags & OUT_OF_RANGE
 
 
 def test_a_code_that_repeats_is_stuck_until_it_moves():
-    s = Sca100t()
+    s = sensor()
     flags = [
         s.measure(sample(x=0x800000 + i, y=0x812345), 0.1 * i).flags
         for i in range(tilts.SCA100T_STUCK_SAMPLES + 1)
@@ -217,5 +228,5 @@ def test_a_code_that_repeats_is_stuck_until_it_moves():
 
 
 def test_both_codes_repeating_are_stuck_sooner():
-    s = Sca100t()
+    s = sensor()
     assert [s.measure(sample(), 0.1 * i).flags for i in range(4)] == [0, 0, STUCK, STUCK]

@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `navigator`: takes an IMU, attitudes and velocities, publishes place, heading and velocity under way."""
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import numpy as np
 from geometry_msgs.msg import Point, TwistWithCovarianceStamped, Vector3
 from nav_msgs.msg import Odometry
@@ -11,6 +15,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from starpos.fix.attitude import Attitude
+from starpos.session.driver import Now
 from starpos.session.navigator import Navigated, NavigatorSession, NavigatorSettings
 from starpos_common.diagnostics import Diagnostics
 from starpos_common.messages import quaternion, unix_to_stamp
@@ -93,20 +98,12 @@ class NavigatorNode(Node):
         )
         self._outputs = NavigatorPublishers(self, self._settings)
         session, best_effort = self._session, ReliabilityPolicy.BEST_EFFORT
-        subscription(self, Imu, "imu/data", self._on_imu, IMU_QUEUE, best_effort)
-        subscription(self, msg.Attitude, "attitude", self._on_attitude, 100)
+        subscription(self, Imu, "imu/data", self._taker(session.receive_imu), IMU_QUEUE, best_effort)
+        subscription(self, msg.Attitude, "attitude", self._taker(session.receive_attitude), 100)
         for kind, name in ((Odometry, "odom"), (TwistWithCovarianceStamped, "twist")):
-            subscription(
-                self,
-                kind,
-                name,
-                lambda m, n=name: session.receive_velocity(m, now_of(self), n),
-                1000,
-                best_effort,
-            )
-        subscription(
-            self, NavSatFix, "gnss/fix", lambda m: session.receive_gnss(m, now_of(self)), 10, best_effort
-        )
+            take = self._taker(partial(session.receive_velocity, name=name))
+            subscription(self, kind, name, take, 1000, best_effort)
+        subscription(self, NavSatFix, "gnss/fix", self._taker(session.receive_gnss), 10, best_effort)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._diagnostics = Diagnostics(
             self,
@@ -119,13 +116,14 @@ class NavigatorNode(Node):
         self._outputs.parameters_set()
         self._session.parameters_set()
 
-    def _on_imu(self, message: Imu) -> None:
-        for output in self._session.receive_imu(message, now_of(self)):
-            self._outputs.publish(output)
+    def _taker(self, receive: Callable[[Any, Now], list[Navigated]]) -> Callable[[Any], None]:
+        """What takes the messages of a topic: the session receives them, and its outputs are published."""
 
-    def _on_attitude(self, message: msg.Attitude) -> None:
-        for output in self._session.receive_attitude(message, now_of(self)):
-            self._outputs.publish(output)
+        def take(message: Any) -> None:
+            for output in receive(message, now_of(self)):
+                self._outputs.publish(output)
+
+        return take
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._session.reset()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `solver`: takes stars and tilts, publishes `fix`, `heading/imu` and `solver/solution`."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -15,6 +15,7 @@ from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from starpos.instrument.camera import Camera
+from starpos.recording.topics import ALL_INPUTS
 from starpos.session import reports
 from starpos.session.driver import Output, Sent
 from starpos.session.gnss import GNSS_TOPIC, ComparedPlaces
@@ -74,22 +75,17 @@ class SolverNode(Node):
         self._outputs = SolutionPublishers(self, self._settings)
         self._transforms = StaticTransforms(self)
         session = self._session
-        take = self._taker(CAMERA_TOPIC, lambda m, _: session.receive_camera(m, now_of(self)))
-        subscription_from_any(self, CameraInfo, CAMERA_TOPIC, take, 10)
-        take = self._taker("tilt", lambda m, info: session.receive_tilt(m, _sent(info), now_of(self)))
-        self._tilts = subscription(self, msg.Tilt, "tilt", take, TILT_QUEUE)
-        take = self._taker("stars", lambda m, info: session.receive_stars(m, now_of(self), _sent(info)))
-        self._stars = subscription(self, msg.StarArray, "stars", take, STARS_QUEUE)
+        subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._taker(CAMERA_TOPIC), 10)
+        self._tilts = subscription(self, msg.Tilt, "tilt", self._taker("tilt"), TILT_QUEUE)
+        self._stars = subscription(self, msg.StarArray, "stars", self._taker("stars"), STARS_QUEUE)
         if session.satellites is not None:
-            take = self._taker("trails", lambda m, _: session.receive_trails(m, now_of(self)))
-            subscription(self, msg.TrailArray, "trails", take, 10)
+            subscription(self, msg.TrailArray, "trails", self._taker("trails"), 10)
         self._again = self.create_guard_condition(self._go_on)
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
         self._gnss = ComparedPlaces()
-        taught = self._taker(GNSS_TOPIC, lambda m, _: session.receive_gnss(m, now_of(self)))
-        hear = self._compare_gnss if session.gnss is None else taught
+        hear = self._compare_gnss if session.gnss is None else self._taker(GNSS_TOPIC)
         # receivers' drivers publish in either way
         subscription(self, NavSatFix, GNSS_TOPIC, hear, 10, ReliabilityPolicy.BEST_EFFORT)
         self.create_service(Solve, "~/solve", self._on_solve)
@@ -131,12 +127,12 @@ class SolverNode(Node):
 
     # inputs ----------------------------------------------------------------------------------------------------------
 
-    def _taker(self, name: str, receive: Callable[[Any, Mapping[str, Any]], list[Output]]) -> Take:
+    def _taker(self, name: str) -> Take:
         """What takes the messages of a topic: the session receives them, and its outputs are published."""
 
         def take(message: Any, info: Mapping[str, Any]) -> None:
             self._note_dropped(name, info)
-            self._publish(receive(message, info))
+            self._publish(self._session.receive(ALL_INPUTS[name], message, now_of(self), _sent(info)))
 
         return take
 

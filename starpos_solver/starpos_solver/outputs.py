@@ -30,25 +30,27 @@ DEFLECTION = "deflection"
 # m2; with a NaN consumers would drop the whole matrix.
 UNKNOWN_ALTITUDE_VARIANCE = 1e8
 NAN = math.nan
+# fields of a Solution that are NaN where they are not known
+NUMBERS = [
+    name for name, kind in msg.Solution.get_fields_and_field_types().items() if kind.startswith("double")
+]
 
 
 def nav_sat_fix(
     header: Header, ground: Geodetic | None, altitude: float, altitude_stddev: float
 ) -> NavSatFix:
     """Make a NavSatFix on WGS 84; without a position NO_FIX with NaN, so that consumers see the instrument at work."""
-    if ground is None:
-        return _nav_sat_fix(header, None, NAN, np.zeros((3, 3)))
     covariance = np.zeros((3, 3))
-    covariance[:2, :2] = ground.covariance[:2, :2]
-    covariance[2, 2] = UNKNOWN_ALTITUDE_VARIANCE if math.isnan(altitude) else altitude_stddev**2
+    if ground is not None:
+        covariance[:2, :2] = ground.covariance[:2, :2]
+        covariance[2, 2] = UNKNOWN_ALTITUDE_VARIANCE if math.isnan(altitude) else altitude_stddev**2
     return _nav_sat_fix(header, ground, altitude, covariance)
 
 
 def fix_by_satellites(header: Header, fix: "SatelliteFix | None") -> NavSatFix:
     """Make a NavSatFix on WGS 84 with its height, of satellites among the stars; without a place NO_FIX with NaN."""
-    if fix is None:
-        return _nav_sat_fix(header, None, NAN, np.zeros((3, 3)))
-    return _nav_sat_fix(header, fix, fix.height_m, fix.covariance)
+    height_m, covariance = (NAN, np.zeros((3, 3))) if fix is None else (fix.height_m, fix.covariance)
+    return _nav_sat_fix(header, fix, height_m, covariance)
 
 
 def _nav_sat_fix(
@@ -92,37 +94,48 @@ def imu(header: Header, link: Attitude) -> Imu:
 def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.Solution:
     """Make the Solution message with everything known about one frame."""
     message = msg.Solution(header=header, status=STATUS[answer.status], status_text=answer.message)
+    for name in NUMBERS:
+        setattr(message, name, [NAN] * 9 if name.startswith("covariance") else NAN)
     message.stars_detected, message.stars_matched = answer.stars_detected, len(answer.names)
     message.ids, message.warnings = list(answer.names), list(answer.warnings)
     message.indices = [] if answer.star is None else answer.star.tolist()
     message.magnitudes = [] if answer.magnitudes is None else answer.magnitudes.tolist()
     message.identify_seconds, message.fix_seconds = answer.identify_s, answer.fix_s
-    a, fix = answer.pointing, answer.fix
-    message.right_ascension, message.declination, message.roll = (
-        (math.degrees(v) for v in (a.ra, a.dec, a.roll)) if a else (NAN,) * 3
-    )
-    message.focal_px, message.log_odds = (a.focal_px, a.log_odds) if a else (NAN, NAN)
-    message.mirrored = bool(a and a.mirrored)
-    message.residual = fix.residual_arcsec if fix else a.residual_arcsec if a else NAN
+    if (a := answer.pointing) is not None:
+        angles = (math.degrees(v) for v in (a.ra, a.dec, a.roll))
+        message.right_ascension, message.declination, message.roll = angles
+        message.focal_px, message.log_odds, message.mirrored = a.focal_px, a.log_odds, bool(a.mirrored)
+        message.residual = a.residual_arcsec
     if answer.tilt:
         message.tilt = tilt_to_message(answer.tilt, "")
         message.tilt_samples = answer.tilt.samples
     else:
         message.tilt.z = message.tilt.z_variance = NAN
-    if fix is None or ground is None:
-        for name in ("latitude", "longitude", "latitude_geodetic", "longitude_geodetic", "heading", "heading_stddev",
-                     "refraction", "diurnal_aberration", "ut1_minus_utc", "xi", "eta"):  # fmt: skip
-            setattr(message, name, NAN)
-        message.covariance = message.covariance_geodetic = [NAN] * 9
-        if answer.at_place is not None:
-            _add_heading(message, answer.at_place)
-        return message
+    fix, at_place = answer.fix, answer.at_place
+    if fix is not None and ground is not None:
+        _add_fix(message, fix, ground)
+    elif at_place is not None:
+        _add_corrections(message, at_place)
+        deflection = at_place.place.deflection
+        message.xi, message.eta = deflection.xi_arcsec, deflection.eta_arcsec
+        for term in at_place.true_north.terms:
+            heading = math.degrees(math.sqrt(term.covariance[2, 2]))
+            message.budget.append(
+                msg.ErrorTerm(name=term.name, east=NAN, north=NAN, heading=heading, common=term.common)
+            )
+    if at_place is not None:
+        link = at_place.true_north
+        message.heading = math.degrees(link.heading)
+        message.heading_stddev = math.degrees(math.sqrt(link.angles_covariance[0, 0]))
+    return message
+
+
+def _add_fix(message: msg.Solution, fix: Fix, ground: Geodetic) -> None:
     degrees = np.array([1.0, 1.0, np.degrees(1.0)])
+    message.residual = fix.residual_arcsec
     message.latitude, message.longitude = math.degrees(fix.latitude), math.degrees(fix.longitude)
-    message.latitude_geodetic, message.longitude_geodetic = (
-        math.degrees(ground.latitude),
-        math.degrees(ground.longitude),
-    )
+    message.latitude_geodetic = math.degrees(ground.latitude)
+    message.longitude_geodetic = math.degrees(ground.longitude)
     message.xi, message.eta = ground.deflection.xi_arcsec, ground.deflection.eta_arcsec
     message.heading = math.degrees(ground.heading)
     message.covariance = (fix.covariance * np.outer(degrees, degrees)).ravel()
@@ -136,9 +149,6 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
             msg.ErrorTerm(name=name, east=east, north=north, heading=heading, common=common)
         )
     _add_corrections(message, fix)
-    if answer.at_place is not None:
-        _set_heading(message, answer.at_place)
-    return message
 
 
 def gnss_check(header: Header, check: GnssCheck) -> msg.GnssCheck:
@@ -155,25 +165,6 @@ def gnss_check(header: Header, check: GnssCheck) -> msg.GnssCheck:
         frames=check.frames,
         poses=check.poses,
     )
-
-
-def _add_heading(message: msg.Solution, at_place: AttitudeAtPlace) -> None:
-    """Put the heading at a known place into the message of a frame without a place of its own."""
-    _set_heading(message, at_place)
-    _add_corrections(message, at_place)
-    deflection = at_place.place.deflection
-    message.xi, message.eta = deflection.xi_arcsec, deflection.eta_arcsec
-    for term in at_place.true_north.terms:
-        heading = math.degrees(math.sqrt(term.covariance[2, 2]))
-        message.budget.append(
-            msg.ErrorTerm(name=term.name, east=NAN, north=NAN, heading=heading, common=term.common)
-        )
-
-
-def _set_heading(message: msg.Solution, at_place: AttitudeAtPlace) -> None:
-    link = at_place.true_north
-    message.heading = math.degrees(link.heading)
-    message.heading_stddev = math.degrees(math.sqrt(link.angles_covariance[0, 0]))
 
 
 def _add_corrections(message: msg.Solution, applied: Fix | AttitudeAtPlace) -> None:

@@ -85,7 +85,14 @@ class Transforms:
 
     @cached_property
     def _possible(self) -> bool:
-        return _can_be_told(self._node, self._topic)
+        """Whether there are messages of tf; said in the log if not. Looking takes longer than a fix: it is done once."""
+        if find_spec("tf2_msgs") is not None:
+            return True
+        self._node.get_logger().info(
+            f"tf2_msgs is not installed, so there is no {self._topic}: sudo apt install ros-jazzy-tf2-msgs, or set "
+            "publish_tf to false"
+        )
+        return False
 
     def publish(self, transforms: list[TransformStamped]) -> None:
         """Publish them if the topic is open."""
@@ -120,17 +127,6 @@ class StaticTransforms(Transforms):
             self.publish(stamped)
 
 
-def _can_be_told(node: Node, topic: str) -> bool:
-    """Whether there are messages of tf; says in the log if not. Looking takes longer than a fix: ask once."""
-    if find_spec("tf2_msgs") is not None:
-        return True
-    node.get_logger().info(
-        f"tf2_msgs is not installed, so there is no {topic}: sudo apt install ros-jazzy-tf2-msgs, or set publish_tf to "
-        "false"
-    )
-    return False
-
-
 class SolutionPublishers:
     """Publishes solutions with the present parameters of the node."""
 
@@ -151,7 +147,6 @@ class SolutionPublishers:
         return self._fix, self._imu
 
     def publish(self, output: Output) -> None:
-        """Publish a session's results."""
         header = self._header(output.stamp)
         if isinstance(output, Averaged):
             self._fix_averaged.publish(self._nav_sat_fix(header, output.ground))
@@ -173,7 +168,6 @@ class SolutionPublishers:
         self._solution.publish(self.solution(output))
 
     def solution(self, answered: Answered) -> msg.Solution:
-        """Make the message of a solution."""
         message = outputs.solution(self._header(answered.stamp), answered.solution, answered.ground)
         if answered.no_camera:
             message.status = msg.Solution.NO_CAMERA

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from table import Cost, Row
 
 from starpos.parameters.table import defaults_of
-from starpos_inclinometer.clock import Moment
+from starpos_inclinometer.clock import HostClock, Moment
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.ascii_line import LineDecoder
-from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
+from starpos_inclinometer.sources.mcu import McuDecoder, McuSource
+from starpos_inclinometer.sources.source import Surroundings
 from starpos_testing.emulator import Mcu
 
 RATE_HZ = 50
@@ -26,7 +27,7 @@ def each(samples: int) -> Iterator[tuple[str, float]]:
     values = defaults_of("inclinometer")
     yield "serial, as it is", serial(samples, values)
     yield "serial, compensated", serial(samples, values | COMPENSATED)
-    yield "ascii, lines alone", ascii_lines(samples, values["ascii.pattern"])
+    yield "ascii, lines alone", ascii_lines(samples, values)
 
 
 def rows(options) -> Iterator[Row]:
@@ -45,7 +46,7 @@ def serial(samples: int, values) -> float:
     mcu = Mcu(lambda now: (0.1, -0.2), rate_hz=RATE_HZ, seed=1)
     identity = mcu.reset(0.0)
     lines = [mcu.sample() for _ in range(samples)]
-    decoder, tilts = McuDecoder(RATE_HZ), McuTilts(values)
+    decoder, tilts = McuDecoder(RATE_HZ), McuSource(Surroundings(None, HostClock(), lambda: None), values)
     decoder.decode(identity, Moment(0.0, 0))
     readings, began_s = 0, time.process_time()
     for k, line in enumerate(lines):
@@ -56,9 +57,9 @@ def serial(samples: int, values) -> float:
     return 1e6 * took_s / samples
 
 
-def ascii_lines(samples: int, pattern: str) -> float:
+def ascii_lines(samples: int, values: dict) -> float:
     """Measure the CPU time per line, from bytes to a believed sample, us."""
-    decoder = LineDecoder(pattern, "deg")
+    decoder = LineDecoder(values)
     lines = [b"%.3f,%.3f\r\n" % (3 + k % 7 * 1e-3, -11 - k % 5 * 1e-3) for k in range(samples)]
     began_s = time.process_time()
     believed = sum(len(decoder.decode(line, Moment(k / RATE_HZ, 0))) for k, line in enumerate(lines))

@@ -169,11 +169,11 @@ class Recorder:
 
         settings = Settings.of(None, [f"{name}:={value}" for name, value in known_by(place).items()])
         solver = settings.solver(message_to_camera(self.infos[-1]), None, load_catalogue())
-        tilts = TiltBuffer()
+        tilts = TiltBuffer(settings)
         for tilt in self.tilts:
-            tilts.keep(tilt, settings.tilt_stddev_rad)
+            tilts.keep(tilt)
         stars = replace(message_to_stars(self.stars[stamp]), mid_unix_s=mid_s)
-        return solver.solve(stars, tilts.over(EXPOSURE_S)).fix
+        return solver.solve(stars, tilts).fix
 
 
 def times_off(watcher: Watcher, solutions: list, begun_s: list[float]) -> np.ndarray:

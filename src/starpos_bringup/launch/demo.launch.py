@@ -18,17 +18,8 @@ from launch.actions import ExecuteProcess
 from launch_ros.substitutions import ExecutableInPackage
 
 from starpos_bringup.launch_arguments import number
-from starpos_bringup.launching import COMMON_ARGUMENTS, Common, dashboard, described, process
+from starpos_bringup.launching import dashboard, described, process
 
-ARGUMENTS = (
-    *COMMON_ARGUMENTS,
-    ("latitude", "35.7046", "where the simulated instrument stands, deg"),
-    ("longitude", "51.4106", "the same, east positive, deg"),
-    ("azimuth", "40", "of the optical axis, deg"),
-    ("altitude", "78", "of the optical axis, deg; the inclinometer reaches to 60"),
-    ("cadence", "3", "from frame to frame, s"),
-    ("dashboard", "true", "the web page, at http://127.0.0.1:8042"),
-)
 # deg
 POINTING = {"latitude": (-90, 90), "longitude": (-180, 360), "azimuth": (-360, 360), "altitude": (5, 90)}
 CADENCE_S = 0.01, 86400
@@ -60,7 +51,6 @@ def nodes(told):
     folder = tempfile.mkdtemp(prefix="starpos_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     link = os.path.join(folder, "inclinometer")
-    common = Common.of(told)
     simulated = {f"simulated.{name}": value for name, value in (place | AIR).items()} | {
         "simulated.roll": roll_deg
     }
@@ -75,12 +65,12 @@ def nodes(told):
     return [
         # The emulator is a device, not a node.
         ExecuteProcess(cmd=device, name="emulator", output="screen"),
-        process("starpos_inclinometer", "inclinometer", common, {"inclinometer": {"port": link}}),
-        process("starpos_camera", "camera_detector", common, {"camera": camera}),
-        process("starpos_solver", "solver", common, {"solver": solver}),
-        *dashboard(told, common),
+        process("starpos_inclinometer", "inclinometer", told, {"inclinometer": {"port": link}}),
+        process("starpos_camera", "camera_detector", told, {"camera": camera}),
+        process("starpos_solver", "solver", told, {"solver": solver}),
+        *dashboard(told),
     ]
 
 
 def generate_launch_description():
-    return described(ARGUMENTS, nodes)
+    return described("demo", nodes)

@@ -8,21 +8,12 @@ left_starpos_link and so on,
 unless the file names others: tf knows no namespaces.
 """
 
-from dataclasses import replace
-
 from launch.actions import GroupAction
 from launch_ros.actions import PushRosNamespace
 
 from starpos_bringup import launching
 from starpos_bringup.launch_arguments import names
 
-ARGUMENTS = (
-    ("instruments", None, "names of the instruments, separated by commas: left,right"),
-    *launching.COMMON_ARGUMENTS,
-    ("params_file", None, "parameters of all nodes of all instruments"),
-    ("namespace", "", "of all of them: /NAMESPACE/left/fix and so on"),
-    *launching.LIVE_ARGUMENTS,
-)
 FRAMES = {
     "camera": "starpos_camera_optical_frame",
     "inclinometer": "starpos_inclinometer_frame",
@@ -31,12 +22,11 @@ FRAMES = {
 
 
 def nodes(told):
-    common = launching.Common.of(told)
     groups = []
     for name in names(told, "instruments"):
         frames = {node: {"frame_id": f"{name.replace('/', '_')}_{frame}"} for node, frame in FRAMES.items()}
         # security's policies are of one namespace each
-        own = replace(common, enclaves=f"{common.enclaves}/{name}")
+        own = {**told, "enclaves": f"{told['enclaves'].rstrip('/')}/{name}"}
         groups.append(
             GroupAction(
                 [PushRosNamespace(name), *launching.instrument(own, launching.clock_of(told), frames)]
@@ -46,4 +36,4 @@ def nodes(told):
 
 
 def generate_launch_description():
-    return launching.described(ARGUMENTS, nodes)
+    return launching.described("instruments", nodes)

@@ -13,13 +13,6 @@ from launch.actions import Shutdown
 from starpos_bringup import launching
 from starpos_bringup.launch_arguments import LaunchError, is_true, number
 
-ARGUMENTS = (
-    *launching.COMMON_ARGUMENTS,
-    ("bag", None, "the rosbag2: a folder, or one .mcap or .db3 file"),
-    ("rate", "1", "times real time; 0: as fast as the solver answers"),
-    ("detector", "false", "true: stars from the bag's images instead of the bag's stars"),
-    launching.DASHBOARD_ARGUMENT,
-)
 MAX_RATE = 1e6
 SIMULATED = {"**": {"use_sim_time": True}}
 
@@ -36,19 +29,18 @@ def nodes(told):
     bag = Path(told["bag"]).expanduser()
     if not bag.exists():
         raise LaunchError(f"bag:={bag}: there is no such bag")
-    common = launching.Common.of(told)
-    processes = [launching.process("starpos_solver", "solver", common, SIMULATED)]
+    processes = [launching.process("starpos_solver", "solver", told, SIMULATED)]
     inputs = "stars"
     if is_true(told, "detector"):
-        processes.append(launching.process("starpos_camera", "detector", common, SIMULATED))
+        processes.append(launching.process("starpos_camera", "detector", told, SIMULATED))
         inputs = "images"
     player = ["--rate", f"{rate:g}", "--inputs", inputs, "--", str(bag)]
     return [
         *processes,
-        *launching.dashboard(told, common, SIMULATED),
-        launching.process("starpos_bringup", "replay", common, arguments=player, on_exit=over),
+        *launching.dashboard(told, SIMULATED),
+        launching.process("starpos_bringup", "replay", told, arguments=player, on_exit=over),
     ]
 
 
 def generate_launch_description():
-    return launching.described(ARGUMENTS, nodes)
+    return launching.described("replay", nodes)

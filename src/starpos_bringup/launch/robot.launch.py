@@ -9,38 +9,19 @@ config/existing_robot.yaml.
 
 from starpos_bringup import launching
 
-ARGUMENTS = (
-    ("image", None, "the camera's topic, sensor_msgs/Image, or the one whose /compressed is sent"),
-    ("camera_info", None, "the topic of its intrinsics"),
-    ("imu", None, "the IMU's topic, sensor_msgs/Imu with accelerations"),
-    *launching.COMMON_ARGUMENTS,
-    (
-        "params_file",
-        None,
-        "parameters of the nodes: a copy of config/existing_robot.yaml, with your own values",
-    ),
-    (
-        "namespace",
-        "starpos",
-        "of what the nodes publish: /NAMESPACE/fix, so that it is not mixed with a GNSS receiver's",
-    ),
-    *launching.LIVE_ARGUMENTS,
-    launching.DASHBOARD_ARGUMENT,
-)
-
 
 def nodes(told):
-    common, every = launching.Common.of(told), launching.clock_of(told)
+    every = launching.clock_of(told)
     camera_info, imu = {"camera/camera_info": told["camera_info"]}, {"imu/data": told["imu"]}
     frames = {"camera/image_raw": told["image"], **camera_info, **imu}
     source = every | {"inclinometer": {"source": "imu"}}
     return [
-        launching.process("starpos_camera", "detector", common, every, remaps=frames),
-        launching.process("starpos_inclinometer", "inclinometer", common, source, remaps=imu),
-        launching.process("starpos_solver", "solver", common, every, remaps=camera_info | imu),
-        *launching.dashboard(told, common, every),
+        launching.process("starpos_camera", "detector", told, every, remaps=frames),
+        launching.process("starpos_inclinometer", "inclinometer", told, source, remaps=imu),
+        launching.process("starpos_solver", "solver", told, every, remaps=camera_info | imu),
+        *launching.dashboard(told, every),
     ]
 
 
 def generate_launch_description():
-    return launching.described(ARGUMENTS, nodes)
+    return launching.described("robot", nodes)

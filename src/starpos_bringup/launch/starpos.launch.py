@@ -9,25 +9,16 @@ Without an argument the value of the parameter file holds.
 from starpos_bringup import launching
 from starpos_bringup.launch_arguments import is_true
 
-ARGUMENTS = (
-    *launching.COMMON_ARGUMENTS,
-    *launching.LIVE_ARGUMENTS,
-    ("camera", "", "source of frames: files, simulated, gphoto2, indi, alpaca, video"),
-    ("port", "", "serial port of the inclinometer; prefer a path under /dev/serial/by-id"),
-    ("navigator", "false", "true: also the place under way, by an IMU on imu/data"),
-    launching.DASHBOARD_ARGUMENT,
-)
-
 
 def nodes(told):
     source = {"source": told["camera"]} if told["camera"] else {}
     port = {"port": told["port"]} if told["port"] else {}
-    common, every = launching.Common.of(told), launching.clock_of(told)
-    processes = launching.instrument(common, every | {"camera": source, "inclinometer": port})
+    every = launching.clock_of(told)
+    processes = launching.instrument(told, every | {"camera": source, "inclinometer": port})
     if is_true(told, "navigator"):
-        processes.append(launching.process("starpos_solver", "navigator", common, every))
-    return [*processes, *launching.dashboard(told, common, every)]
+        processes.append(launching.process("starpos_solver", "navigator", told, every))
+    return [*processes, *launching.dashboard(told, every)]
 
 
 def generate_launch_description():
-    return launching.described(ARGUMENTS, nodes)
+    return launching.described("starpos", nodes)

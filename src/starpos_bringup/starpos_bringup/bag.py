@@ -38,15 +38,14 @@ APPENDED: Appended = {name: fields for version in VERSIONS for name, fields in v
 class OlderTypes:
     """The types of APPENDED as earlier versions had them."""
 
-    def knows(self, type_name: str, digest: str) -> bool:
-        """Whether a type with this hash is one of them."""
-        return self._store_of(type_name, digest) is not None
+    def store_of(self, type_name: str, digest: str) -> "Typestore | None":
+        """The types among which one has this hash; None if it is not one of them."""
+        if type_name not in APPENDED:
+            return None
+        return next((s for s in self._then if s.hash_rihs01(type_name) == digest), None)
 
-    def upgraded(self, data: bytes, type_name: str, digest: str) -> bytes:
-        """The bytes of such a message as the type of today has them; as they are if they are broken."""
-        store = self._store_of(type_name, digest)
-        if store is None:
-            return data
+    def upgraded(self, data: bytes, type_name: str, store: "Typestore") -> bytes:
+        """The bytes of a message of older types as the type of today has them; as they are if they are broken."""
         try:
             message = self._completed(store.deserialize_cdr(data, type_name), type_name)
             return bytes(self._now.serialize_cdr(message, type_name))
@@ -60,11 +59,6 @@ class OlderTypes:
             if about in APPENDED:
                 given[name] = self._completed(given[name], about)
         return self._now.types[type_name](**APPENDED[type_name] | given)
-
-    def _store_of(self, type_name: str, digest: str) -> "Typestore | None":
-        if type_name not in APPENDED:
-            return None
-        return next((s for s in self._then if s.hash_rihs01(type_name) == digest), None)
 
     @cached_property
     def _now(self) -> "Typestore":
@@ -91,14 +85,14 @@ TYPE_NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
 class Topic:
     """One topic of a bag: message class and name of its type; latched: late subscribers get the last message too.
 
-    older: hash of its type, if that is one of an earlier version: its messages are upgraded; '' for the type of today.
+    older: the types of an earlier version whose messages it has, which are upgraded; None for the type of today.
     """
 
     name: str
     kind: type
     type_name: str
     latched: bool
-    older: str
+    older: "Typestore | None"
 
 
 class Bag(BagReader):
@@ -119,10 +113,14 @@ class Bag(BagReader):
             of_tilt = () if any(name.endswith("/tilt") for name in names) else (IMU_DATA,)
             ends = tuple("/" + relative for relative in (needed, *others, *of_tilt))
             return [name for name in names if name.endswith(ends)]
-        found = driver_topics(self.connections, remaps, place=self.path) if needed == RAW else {}
+        found = driver_topics(self, remaps) if needed == RAW else {}
         if not found:
-            raise BagError(f"{self.path}: no topic {needed} in it; it has {', '.join(map(repr, names))}")
+            raise self._without(needed)
         return sorted(found.values())
+
+    def _without(self, name: str) -> BagError:
+        known = ", ".join(sorted({repr(c.topic) for c in self.connections}))
+        return BagError(f"{self.path}: no topic {name} in it; it has {known}")
 
     def topics(self, wanted: list[str] | None, left_out: Callable[[str], None]) -> dict[int, Topic]:
         """Find the topics that can be played, by connection; `left_out` gets a sentence for each other topic.
@@ -132,9 +130,7 @@ class Bag(BagReader):
         names = {c.topic for c in self.connections}
         for name in wanted or ():
             if name not in names:
-                raise BagError(
-                    f"{self.path}: no topic {name} in it; it has {', '.join(sorted(map(repr, names)))}"
-                )
+                raise self._without(name)
         topics = {}
         for c in self.connections:
             if c.topic == "/clock" or (wanted and c.topic not in wanted):
@@ -151,11 +147,9 @@ class Bag(BagReader):
         """Read (topic, log time in ns, bytes) in the bag's order; raises BagError if the file breaks off."""
         for connection, log_ns, data in self.messages([c for c in self.connections if c.id in topics]):
             topic = topics[connection.id]
-            yield (
-                topic,
-                log_ns,
-                self._older.upgraded(data, topic.type_name, topic.older) if topic.older else data,
-            )
+            if topic.older is not None:
+                data = self._older.upgraded(data, topic.type_name, topic.older)
+            yield topic, log_ns, data
 
 
 def _topic(connection: "Connection", older: OlderTypes) -> Topic:
@@ -170,14 +164,14 @@ def _topic(connection: "Connection", older: OlderTypes) -> Topic:
     kind = _message_class(connection.msgtype)
     known = _type_hash(connection.msgtype)
     differs = connection.digest.startswith("RIHS01_") and bool(known) and connection.digest != known
-    known_then = differs and older.knows(connection.msgtype, connection.digest)
-    if differs and not known_then:
+    then = older.store_of(connection.msgtype, connection.digest) if differs else None
+    if differs and then is None:
         raise BagError(
             f"its {connection.msgtype} differs from the one installed here: use the version it was recorded with"
         )
     durabilities = [q.durability.name for q in getattr(connection.ext, "offered_qos_profiles", ())]
     latched = bool(durabilities) and all(name == "TRANSIENT_LOCAL" for name in durabilities)
-    return Topic(connection.topic, kind, connection.msgtype, latched, connection.digest if known_then else "")
+    return Topic(connection.topic, kind, connection.msgtype, latched, then)
 
 
 def _message_class(name: str) -> type:

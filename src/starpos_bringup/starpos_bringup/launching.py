@@ -4,8 +4,7 @@
 import atexit
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,39 +15,13 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.substitutions import FindPackageShare
 
+from starpos.parameters.table import rows_of
 from starpos_bringup.launch_arguments import LaunchError, is_true, names, one_of
 
 if TYPE_CHECKING:
     from launch import LaunchDescriptionEntity
 
-Arguments = Iterable[tuple[str, Any, str]]
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
-# Name, default and description of each argument.
-COMMON_ARGUMENTS = (
-    ("namespace", "", "moves the whole instrument: /NAMESPACE/fix and so on"),
-    (
-        "params_file",
-        PathJoinSubstitution([FindPackageShare("starpos_bringup"), "config", "starpos.yaml"]),
-        "parameters of all nodes",
-    ),
-    ("log_level", "info", ", ".join(LOG_LEVELS)),
-    (
-        "outputs",
-        "",
-        "puts fix, fix_averaged and heading/imu under this name: stars is stars/fix, where another driver has fix",
-    ),
-    (
-        "enclaves",
-        "/starpos",
-        "where the SROS2 enclaves are: each process has enclaves/EXECUTABLE, if security is enabled",
-    ),
-)
-# of launch files for a live instrument
-LIVE_ARGUMENTS = (
-    ("use_sim_time", "", "true: time from /clock"),
-    ("respawn", "false", "true: a process that ends, for whatever reason, is started again 2 s later"),
-)
-DASHBOARD_ARGUMENT = ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042")
 RESPAWN_DELAY_S = 2.0
 # Topics of the solver whose names drivers of GNSS and IMUs have, too.
 OUTPUTS = ("fix", "fix_averaged", "heading/imu")
@@ -57,44 +30,26 @@ PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 QUICK_START = PathJoinSubstitution([FindPackageShare("starpos_bringup"), "config", "quick_start.xml"])
 
 
-@dataclass(frozen=True)
-class Common:
-    """Settings that all processes of a launch share."""
-
-    params_file: str
-    log_level: str
-    enclaves: str
-    respawn: bool = False
-    outputs: str = ""
-
-    @classmethod
-    def of(cls, told: Mapping[str, str]) -> "Common":
-        """Make them from the arguments; LaunchError if there is no such parameter file or level."""
-        # launch_ros only warns of a missing file, and the instrument would run with defaults.
-        path = Path(told["params_file"]).expanduser()
-        if not path.is_file():
-            raise LaunchError(f"params_file:={told['params_file']}: there is no such file")
-        respawn = is_true(told, "respawn") if "respawn" in told else False
-        level = one_of(told, "log_level", LOG_LEVELS)
-        outputs = names(told, "outputs")[0] if told["outputs"] else ""
-        return cls(str(path), level, told["enclaves"].rstrip("/"), respawn, outputs)
-
-
 def described(
-    arguments: Arguments, entities: Callable[[Mapping[str, str]], "list[LaunchDescriptionEntity]"]
+    file: str, entities: Callable[[Mapping[str, str]], "list[LaunchDescriptionEntity]"]
 ) -> LaunchDescription:
-    """Describe a launch: `entities` makes what is started from the values of the arguments, in their namespace.
+    """Describe a launch: `entities` makes what is started from the values of the file's arguments, in their namespace."""
+    rows = rows_of(Path(__file__).with_name("data") / "launch.yaml")[file]
 
-    Of two arguments of one name the later holds.
-    """
-    known = {name: (value, text) for name, value, text in arguments}
+    def default(row: Mapping[str, str]) -> str | PathJoinSubstitution | None:
+        if "share" in row:
+            return PathJoinSubstitution([FindPackageShare("starpos_bringup"), *row["share"].split("/")])
+        return row.get("default")
 
     def started(context: Any) -> "list[LaunchDescriptionEntity]":
-        return entities({name: LaunchConfiguration(name).perform(context) for name in known})
+        return entities({name: LaunchConfiguration(name).perform(context) for name in rows})
 
     return LaunchDescription(
         [
-            *(DeclareLaunchArgument(n, default_value=v, description=text) for n, (v, text) in known.items()),
+            *(
+                DeclareLaunchArgument(n, default_value=default(r), description=r["text"])
+                for n, r in rows.items()
+            ),
             PushRosNamespace(LaunchConfiguration("namespace")),
             OpaqueFunction(function=started),
         ]
@@ -106,10 +61,10 @@ def clock_of(told: Mapping[str, str]) -> dict[str, dict[str, bool]]:
     return {"**": {"use_sim_time": is_true(told, "use_sim_time")} if told["use_sim_time"] else {}}
 
 
-def dashboard(told: Mapping[str, str], common: Common, parameters: Mapping[str, Mapping] = {}) -> list[Node]:
+def dashboard(told: Mapping[str, str], parameters: Mapping[str, Mapping] = {}) -> list[Node]:
     """Make the process of the web page, if it is wanted."""
     wanted = is_true(told, "dashboard")
-    return [process("starpos_dashboard", "dashboard", common, parameters)] if wanted else []
+    return [process("starpos_dashboard", "dashboard", told, parameters)] if wanted else []
 
 
 # Package, executable and nodes of each process of an instrument; camera and detector are one.
@@ -121,7 +76,7 @@ INSTRUMENT = (
 
 
 def instrument(
-    common: Common, parameters: Mapping[str, Mapping] = {}, defaults: Mapping[str, Mapping] = {}
+    told: Mapping[str, str], parameters: Mapping[str, Mapping] = {}, defaults: Mapping[str, Mapping] = {}
 ) -> list[Node]:
     """Make the processes of an instrument; parameters and defaults of its nodes as in `process`."""
 
@@ -129,7 +84,7 @@ def instrument(
         return {name: values for name, values in every.items() if name in ("**", *nodes)}
 
     return [
-        process(package, executable, common, of(nodes, parameters), defaults=of(nodes, defaults))
+        process(package, executable, told, of(nodes, parameters), defaults=of(nodes, defaults))
         for package, executable, nodes in INSTRUMENT
     ]
 
@@ -137,27 +92,32 @@ def instrument(
 def process(
     package: str,
     executable: str,
-    common: Common,
+    told: Mapping[str, str],
     parameters: Mapping[str, Mapping] = {},
     arguments: Sequence[str] = (),
     defaults: Mapping[str, Mapping] = {},
     remaps: Mapping[str, str] = {},
     **options: Any,
 ) -> Node:
-    """Make a process.
+    """Make a process; LaunchError if an argument is wrong.
 
+    told: the values of the launch file's arguments.
     parameters, defaults: of its nodes, by name ('**' is all); the parameter file counts less than parameters, more
     than defaults.  remaps: topics by the names that the nodes know them by.
     """
     renamed = [word for name, topic in remaps.items() for word in ("-r", f"{name}:={topic}")]
-    files = [_written(defaults), common.params_file, _written(parameters)]
+    # launch_ros only warns of a missing file, and the instrument would run with defaults
+    file = Path(told["params_file"]).expanduser()
+    if not file.is_file():
+        raise LaunchError(f"params_file:={told['params_file']}: there is no such file")
+    files = [_written(defaults), str(file), _written(parameters)]
     return Node(
         package=package,
         executable=executable,
         parameters=[file for file in files if file],
-        arguments=[*arguments, *ros_arguments(executable, common), *renamed],
+        arguments=[*arguments, *ros_arguments(executable, told), *renamed],
         output="screen",
-        respawn=common.respawn,
+        respawn="respawn" in told and is_true(told, "respawn"),
         respawn_delay=RESPAWN_DELAY_S,
         additional_env=profile(),
         **options,
@@ -169,13 +129,12 @@ def profile() -> dict[str, PathJoinSubstitution]:
     return {} if any(name in os.environ for name in PROFILES) else dict.fromkeys(PROFILES, QUICK_START)
 
 
-def ros_arguments(executable: str, common: Common) -> list[str]:
+def ros_arguments(executable: str, told: Mapping[str, str]) -> list[str]:
     """Make the arguments for ROS; the enclave is only a name while security is not enabled (ROS_SECURITY_ENABLE)."""
-    enclave = f"{common.enclaves}/{executable}"
-    remaps = [
-        word for name in OUTPUTS if common.outputs for word in ("-r", f"{name}:={common.outputs}/{name}")
-    ]
-    return ["--ros-args", "--log-level", common.log_level, "--enclave", enclave, *remaps]
+    enclave = f"{told['enclaves'].rstrip('/')}/{executable}"
+    outputs = names(told, "outputs")[:1] if told["outputs"] else []
+    remaps = [word for below in outputs for name in OUTPUTS for word in ("-r", f"{name}:={below}/{name}")]
+    return ["--ros-args", "--log-level", one_of(told, "log_level", LOG_LEVELS), "--enclave", enclave, *remaps]
 
 
 def _written(parameters: Mapping[str, Mapping]) -> str:

@@ -44,7 +44,7 @@ class Player:
     """Publishes the topics of a bag, and hears how far the solvers and detectors are with its frames.
 
     frames: number of frames that a solver could answer: star lists, and images unless only star lists have subscribers.
-    answers, fixes: of the solvers.  lost: whether an answer was waited for in vain.
+    answers, fixes: of the solvers.  lost: how often an answer was waited for in vain.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Player:
         # the bag's times (ns) of the frames that a solver has not answered yet; images that a detector has not searched
         self._unanswered: deque[int] = deque()
         self._unsearched = 0
-        self._in_vain = 0
+        self.lost = 0
         # topics that are played, and published by another node too
         self._doubled: list[str] = []
         self._listeners: list[int] = []
@@ -97,11 +97,6 @@ class Player:
         silent = PublisherEventCallbacks(use_default_callbacks=False)
         return node.create_publisher(topic.kind, topic.name, profile, event_callbacks=silent)
 
-    @property
-    def lost(self) -> bool:
-        """Whether an answer was waited for in vain."""
-        return self._in_vain > 0
-
     def wait(self, at_most_s: float, *, for_solver: bool) -> None:
         """Wait until all listeners are found, or time is up; then report missing ones and other publishers.
 
@@ -112,7 +107,7 @@ class Player:
         self._spin(min(at_most_s, FOUND_S), self._settled)
         if self._stopped or not self._frame_publishers:
             return
-        if not self._are_heard(self._frame_publishers):
+        if not _are_heard(self._frame_publishers):
             names = ", ".join(p.topic_name for p in self._frame_publishers)
             self._say(
                 f"no node subscribes to {names}: start detector or solver in its namespace, with use_sim_time, or remap "
@@ -168,12 +163,7 @@ class Player:
             self._listeners, self._unchanged_since_s = listeners, time.monotonic()
         return time.monotonic() - self._unchanged_since_s >= SETTLED_S
 
-    @staticmethod
-    def _are_heard(publishers: Iterable[Publisher]) -> bool:
-        return any(p.get_subscription_count() for p in publishers)
-
     def start_round(self) -> None:
-        """Begin to play from the beginning."""
         self._now_ns, self._ticked_ns = None, 0
         self._first_ns: int | None = None
         self._begin_s = time.monotonic()
@@ -216,9 +206,9 @@ class Player:
 
     def _follow(self, topic: Topic, publisher: Publisher) -> None:
         """Count a frame; wait until a detector has searched an image, as it keeps only the newest."""
-        heard = self._are_heard([publisher])
+        heard = _are_heard([publisher])
         is_image = topic.type_name in IMAGES
-        self.frames += not is_image or heard or not self._are_heard(self._frame_publishers)
+        self.frames += not is_image or heard or not _are_heard(self._frame_publishers)
         if not heard:
             return
         if is_image and self._made_stars:
@@ -243,14 +233,14 @@ class Player:
 
     def _await(self, done: Callable[[], bool]) -> bool:
         """Wait for nodes that follow, without time going on; False if they do not in PATIENCE_S, which is said."""
-        if self._in_vain >= MAX_IN_VAIN:
+        if self.lost >= MAX_IN_VAIN:
             return False
         waits_s = time.monotonic()
         came = self._spin(PATIENCE_S, done)
         self._begin_s += time.monotonic() - waits_s
         if came or self._stopped:
             return True
-        self._in_vain += 1
+        self.lost += 1
         self._say(f"a frame was not answered in {PATIENCE_S:.0f} s: it goes on without the answer")
         return False
 
@@ -301,7 +291,10 @@ class Player:
             self._say(f"{(self._now_ns - self._first_ns) * 1e-9:.0f} s of the bag, {self.count} messages")
 
     def close(self) -> None:
-        """End the nodes."""
         self._executor.shutdown()
         self._node.destroy_node()
         self._frame_node.destroy_node()
+
+
+def _are_heard(publishers: Iterable[Publisher]) -> bool:
+    return any(p.get_subscription_count() for p in publishers)

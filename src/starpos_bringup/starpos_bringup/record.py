@@ -15,34 +15,17 @@ from starpos_bringup.bag import BagWriter
 if TYPE_CHECKING:
     from starpos_bringup.recorder import FolderWriter, Recorder
 
-# Types by relative names.
-TOPICS = {
-    "camera/camera_info": "sensor_msgs/msg/CameraInfo",
-    "camera/capture": "starpos_interfaces/msg/Capture",
-    "stars": "starpos_interfaces/msg/StarArray",
-    "tilt": "starpos_interfaces/msg/Tilt",
-    "trails": "starpos_interfaces/msg/TrailArray",
-    "attitude": "starpos_interfaces/msg/Attitude",
-    "fix": "sensor_msgs/msg/NavSatFix",
-    "fix_averaged": "sensor_msgs/msg/NavSatFix",
-    "gnss/fix": "sensor_msgs/msg/NavSatFix",
-    "gnss/check": "starpos_interfaces/msg/GnssCheck",
-    "heading/imu": "sensor_msgs/msg/Imu",
-    "satellites/fix": "sensor_msgs/msg/NavSatFix",
-    "solver/solution": "starpos_interfaces/msg/Solution",
-    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
-}
-IMAGES = {"camera/image_raw": "sensor_msgs/msg/Image"}
+DATA = Path(__file__).with_name("data")
 # Exit statuses.
 SAVED, BROKEN_OFF, REFUSED = 0, 1, 2
 
 
 def record() -> int:
-    """Run the executable."""
     from starpos_common.node_main import own_arguments, run
 
     options = parser_of("record").parse_args(own_arguments(sys.argv[1:])[0])
-    topics = TOPICS | (IMAGES if options.images else {})
+    rows = rows_of(DATA / "recorded.yaml")
+    topics = {name: row for name, row in rows.items() if options.images or not row.get("images")}
     try:
         writer = BagWriter(options.bag)
     except BagError as error:
@@ -62,7 +45,7 @@ def record() -> int:
 
 def parser_of(executable: str) -> argparse.ArgumentParser:
     """The parser of an executable of this package, from its row."""
-    row = rows_of(Path(__file__).with_name("data") / "executables.yaml")[executable]
+    row = rows_of(DATA / "executables.yaml")[executable]
     return Command(**row).define(argparse.ArgumentParser(prog=executable))
 
 
@@ -71,7 +54,6 @@ def say(sentence: str) -> None:
 
 
 def folder() -> int:
-    """Run the executable."""
     from starpos_common.node_main import own_arguments, run
 
     path = parser_of("folder").parse_args(own_arguments(sys.argv[1:])[0]).folder

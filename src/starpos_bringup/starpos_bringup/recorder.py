@@ -28,30 +28,27 @@ from starpos_interfaces.msg import StarArray, Tilt
 
 # Free space on the disk below which there is a warning.
 LITTLE_BYTES = 1_000_000_000
-# An image may have 42 MB.
-DEPTH, IMAGE_DEPTH = 1000, 3
-# Topics that are published transient_local.
-LATCHED = ("camera/camera_info",)
+DEPTH = 1000
 
 
 class Recorder(Node):
     """Writes each message as it comes, with the node's time; ends the program if the bag cannot be written any more.
 
-    topics: types by relative names.  say: takes a sentence for the person at the terminal.
+    topics: rows of data/recorded.yaml.  say: takes a sentence for the person at the terminal.
     """
 
-    def __init__(self, writer: BagWriter, topics: Mapping[str, str], say: Callable[[str], None]) -> None:
+    def __init__(self, writer: BagWriter, topics: Mapping[str, Mapping], say: Callable[[str], None]) -> None:
         super().__init__("record", start_parameter_services=False)
         # Why the recording broke off.
         self.trouble = ""
         self._writer, self._say = writer, say
-        for name, type_name in topics.items():
-            package, message = type_name.split("/msg/")
+        for name, row in topics.items():
+            package, message = row["type"].split("/msg/")
             kind = getattr(import_module(f"{package}.msg"), message)
             topic = self.resolve_topic_name(name)
-            writer.add_topic(topic, type_name, latched=name in LATCHED)
-            depth = IMAGE_DEPTH if message == "Image" else DEPTH
-            subscription(self, kind, topic, partial(self._keep, name, topic), depth, raw=True)
+            writer.add_topic(topic, row["type"], latched=row.get("latched", False))
+            keep, depth = partial(self._keep, name, topic), row.get("depth", DEPTH)
+            subscription(self, kind, topic, keep, depth, raw=True)
         self._counts = dict.fromkeys(topics, 0)
         self._diagnostics = Diagnostics(self, {"Bag": self._report}, str(writer.folder))
         say(f"{writer.folder}: recording {len(topics)} topics until Ctrl-C")

@@ -7,6 +7,7 @@ For machines without `ros2 bag play`, and to play as fast as the solver answers,
 import argparse
 import sys
 import time
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from starpos.errors import BagError, FrameError, StarposError
@@ -29,7 +30,6 @@ WAIT_S, WAIT_FOR_INPUTS_S = 3.0, 30.0
 
 
 def replay() -> int:
-    """Run the executable."""
     with stop_signals() as stopped:
         return main(sys.argv[1:], stopped)
 
@@ -68,21 +68,17 @@ def _play(
     # Frames have a participant of their own, as a camera has. Otherwise they would fill the shared memory of the other
     # messages, and a lost message is repeated only a second later.
     contexts = rclpy.Context(), rclpy.Context()
-    try:
+    with ExitStack() as stack:
         for context in contexts:
-            rclpy.init(args=ros, context=context, signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:
-        # The --ros-args are wrong; rcl has an error class for each.
-        raise StarposError(str(error)) from None
-    try:
+            stack.callback(context.try_shutdown)
+            try:
+                rclpy.init(args=ros, context=context, signal_handler_options=SignalHandlerOptions.NO)
+            except Exception as error:
+                # The --ros-args are wrong; rcl has an error class for each.
+                raise StarposError(str(error)) from None
         player = Player(topics.values(), options.rate, stopped, contexts, _say)
-        try:
-            return _rounds(player, bag, topics, options, stopped)
-        finally:
-            player.close()
-    finally:
-        for context in contexts:
-            context.try_shutdown()
+        stack.callback(player.close)
+        return _rounds(player, bag, topics, options, stopped)
 
 
 def _rounds(

@@ -249,7 +249,7 @@ def test_a_robots_topics_are_remapped_and_its_own_fix_has_another_name():
         p.user_file for p in robot.values()
     } == {mine}
     with pytest.raises(RuntimeError, match='"image" was not provided'):
-        started("robot")
+        started("robot", params_file=mine)
 
 
 def test_a_replay_takes_the_stars_or_finds_them_again(bag):

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+TOLD = {"log_level": "info", "enclaves": "/starpos", "outputs": ""}
+
 
 @pytest.fixture
 def launching(launch):
@@ -19,7 +21,7 @@ def environment(launching, tmp_path, monkeypatch):
     """Variables of a process besides the environment's, given variables of the user's."""
     parameters = tmp_path / "mine.yaml"
     parameters.write_text("")
-    common = launching.Common(str(parameters), "info", "/starpos")
+    told = TOLD | {"params_file": str(parameters)}
     for name in launching.PROFILES:
         monkeypatch.delenv(name, raising=False)
 
@@ -28,7 +30,7 @@ def environment(launching, tmp_path, monkeypatch):
 
         for name, value in of_user.items():
             monkeypatch.setenv(name, value)
-        context, process = LaunchContext(), launching.process("starpos_solver", "solver", common)
+        context, process = LaunchContext(), launching.process("starpos_solver", "solver", told)
         return dict(
             ("".join(part.perform(context) for part in text) for text in pair)
             for pair in process.additional_env or ()
@@ -50,11 +52,10 @@ def test_profiles_of_the_users_stay(environment, name):
 
 
 def test_outputs_are_put_under_a_name_of_their_own(launching):
-    common = launching.Common("", "info", "/starpos", outputs="stars")
-    words = launching.ros_arguments("solver", common)
+    words = launching.ros_arguments("solver", TOLD | {"outputs": "stars"})
     assert [w for w in words if ":=" in w] == [
         "fix:=stars/fix",
         "fix_averaged:=stars/fix_averaged",
         "heading/imu:=stars/heading/imu",
     ]
-    assert "-r" not in launching.ros_arguments("solver", launching.Common("", "info", "/starpos"))
+    assert "-r" not in launching.ros_arguments("solver", TOLD)

@@ -18,7 +18,7 @@ S = 10**9
 
 
 def topic(name, kind, type_name):
-    return Topic(name, kind, type_name, latched=False, older="")
+    return Topic(name, kind, type_name, latched=False, older=None)
 
 
 TOPICS = {"/stars": topic("/stars", StarArray, STARS), IMAGES: topic(IMAGES, Image, IMAGE)}

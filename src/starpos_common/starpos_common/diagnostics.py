@@ -19,8 +19,6 @@ from starpos.session.driver import Diagnosis, Level
 
 __all__ = ["Diagnosis", "Diagnostics", "Level"]
 
-# for the tasks of the nodes
-
 PERIOD_S = 1.0
 
 

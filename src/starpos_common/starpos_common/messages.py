@@ -70,7 +70,6 @@ def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
 
 
 def trails_to_message(trails: Iterable[FrameTrail], header: Header) -> msg.TrailArray:
-    """Convert the trails of a frame to a TrailArray."""
     return msg.TrailArray(
         header=header,
         trails=[
@@ -110,7 +109,6 @@ def shutter_fields(shutter: Shutter | None) -> dict[str, Any]:
 
 
 def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0) -> msg.Tilt:
-    """Convert a tilt to starpos_interfaces/Tilt."""
     return msg.Tilt(
         header=Header(stamp=unix_to_stamp(tilt.utc_unix_s), frame_id=frame_id),
         x=float(tilt.theta_x),
@@ -130,7 +128,6 @@ def quaternion(turn: np.ndarray) -> Quaternion:
 
 
 def attitude_to_message(attitude: CameraAttitude) -> msg.Attitude:
-    """Convert the attitude of a camera to starpos_interfaces/Attitude."""
     return msg.Attitude(
         header=Header(stamp=unix_to_stamp(attitude.utc_unix_s), frame_id=attitude.frame_id),
         orientation=quaternion(attitude.camera_to_gcrs),

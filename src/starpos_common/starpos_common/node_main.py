@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -99,36 +99,24 @@ def end_within(seconds: float, status: int) -> Iterator[None]:
 NOTICE_S = 0.5
 
 
-@runtime_checkable
-class Closing(Protocol):
-    """A node with something of its own to put away: threads, devices, files."""
-
-    def close(self) -> None:
-        """Put it away, however long that takes; called once, when no callback runs any more."""
-
-
-def run(
-    make_nodes: Callable[[], "Iterator[Node]"],
-    args: list[str] | None = None,
-    help_text: Callable[[], str] | None = None,
-) -> int:
+def run(make_nodes: Callable[[], "Iterator[Node]"], help_text: Callable[[], str] | None = None) -> int:
     """Run the nodes that `make_nodes()` yields until a signal stops them; return the process's exit status.
 
     make_nodes: a generator, started after rclpy.init; it may raise StarposError or one of rclpy's parameter errors to
     refuse to start.
-    args: the command line, by default sys.argv.
     help_text: makes the text for `--help` or `-h`; None: they have no meaning here.
 
-    At the end each node that is `Closing` is closed; then the middleware has MAX_END_S to end, or the process leaves.
+    At the end, when no callback runs any more, each node that has a `close` is closed, however long that takes; then the
+    middleware has MAX_END_S to end, or the process leaves.
 
     The status is 0 after SIGINT (once or twice) or SIGTERM, and 1 with one line on standard error when the start is
     refused. Any other exception of a callback is a defect: it ends the process with its traceback.
     """
     with stop_signals() as stopped:
-        if help_text is not None and _asks_for_help(sys.argv[1:] if args is None else args):
+        if help_text is not None and not {"--help", "-h"}.isdisjoint(own_arguments(sys.argv[1:])[0]):
             _show(help_text())
             return 0
-        return _run(make_nodes, args, stopped)
+        return _run(make_nodes, stopped)
 
 
 def run_executable(
@@ -170,10 +158,6 @@ def _show(text: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _asks_for_help(args: list[str]) -> bool:
-    return not {"--help", "-h"}.isdisjoint(own_arguments(args)[0])
-
-
 def leave(status: int) -> int:
     """Return the status; if a thread of the node still works, end the process with that status at once.
 
@@ -186,7 +170,7 @@ def leave(status: int) -> int:
     return status
 
 
-def _run(make_nodes: Callable[[], "Iterator[Node]"], args: list[str] | None, stopped: list[int]) -> int:
+def _run(make_nodes: Callable[[], "Iterator[Node]"], stopped: list[int]) -> int:
     import rclpy
     from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
     from rclpy.exceptions import ParameterException
@@ -199,7 +183,7 @@ def _run(make_nodes: Callable[[], "Iterator[Node]"], args: list[str] | None, sto
     if stopped:
         return 0
     try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except UnknownROSArgsError as error:
         # Its text is the list of them alone.
         return 0 if stopped else _refuse(f"unknown arguments after --ros-args: {error}")
@@ -234,7 +218,7 @@ def _run(make_nodes: Callable[[], "Iterator[Node]"], args: list[str] | None, sto
             raise
     finally:
         for node in reversed(nodes):
-            if isinstance(node, Closing):
+            if hasattr(node, "close"):
                 node.close()
         with end_within(MAX_END_S, int(sys.exc_info()[0] is not None)):
             for node in reversed(nodes):

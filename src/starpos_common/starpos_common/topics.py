@@ -5,8 +5,9 @@ The QoS of each topic is in the parameters `qos_overrides.TOPIC...`.
 """
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -20,7 +21,8 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from starpos.parameters.table import ParameterError
 
 MAX_DEPTH = 100_000
-T = TypeVar("T")
+# no warning of rclpy's where a publisher does not match
+SILENT = SubscriptionEventCallbacks(use_default_callbacks=False)
 # A message, and the middleware's information on it.
 Take = Callable[[Any, Mapping[str, Any]], object]
 
@@ -32,11 +34,8 @@ def publisher(node: Node, kind: type, topic: str, depth: int, latched: bool = Fa
     """
     durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
     qos = QoSProfile(depth=depth, durability=durability)
-
-    def make() -> Publisher:
+    with _overridden(node, topic):
         return node.create_publisher(kind, topic, qos, qos_overriding_options=_options())
-
-    return _made(node, topic, make)
 
 
 def subscription(
@@ -55,13 +54,10 @@ def subscription(
     """
     # rclpy writes the overrides into the profile: a shared profile would carry them to the next topic.
     qos = QoSProfile(depth=depth, reliability=reliability)
-
-    def make() -> Subscription:
+    with _overridden(node, topic):
         return node.create_subscription(
             kind, topic, callback, qos, raw=raw, event_callbacks=events, qos_overriding_options=_options()
         )
-
-    return _made(node, topic, make)
 
 
 def subscription_from_any(node: Node, kind: type, topic: str, callback: Take, depth: int) -> None:
@@ -82,13 +78,11 @@ def subscription_from_any(node: Node, kind: type, topic: str, callback: Take, de
 
     # rclpy's types know callbacks of one argument only
     heard: Callable[..., None] = once
-    # a publisher that one of them does not match is no reason for its warning
-    silent = SubscriptionEventCallbacks(use_default_callbacks=False)
-    subscription(node, kind, topic, heard, depth, events=silent)
+    subscription(node, kind, topic, heard, depth, events=SILENT)
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     best_effort = QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
     for qos in (latched, best_effort):
-        node.create_subscription(kind, topic, heard, qos, event_callbacks=silent)
+        node.create_subscription(kind, topic, heard, qos, event_callbacks=SILENT)
 
 
 def _options() -> QoSOverridingOptions:
@@ -102,9 +96,10 @@ def _checked(qos: QoSProfile) -> QosCallbackResult:
     return result
 
 
-def _made(node: Node, topic: str, make: Callable[[], T]) -> T:
+@contextmanager
+def _overridden(node: Node, topic: str) -> Iterator[None]:
     try:
-        return make()
+        yield
     except RCLError:
         raise
     except (RuntimeError, InvalidQosOverridesError) as error:
@@ -131,9 +126,7 @@ class MatchedSubscription:
         self._node, self._kind = node, kind
         # rclpy's types know callbacks of one argument only
         self._callback: Callable[..., Any] = callback
-        self._subscription = subscription(
-            node, kind, topic, callback, depth, events=SubscriptionEventCallbacks(use_default_callbacks=False)
-        )
+        self._subscription = subscription(node, kind, topic, callback, depth, events=SILENT)
         self.topic = self._subscription.topic_name
         self._qos: QoSProfile = self._subscription.qos_profile
         self._fixed = self._qos.reliability != RELIABLE
@@ -154,11 +147,7 @@ class MatchedSubscription:
         self._qos = QoSProfile(history=self._qos.history, depth=self._qos.depth, reliability=wanted)
         self.destroy()
         self._subscription = self._node.create_subscription(
-            self._kind,
-            self.topic,
-            self._callback,
-            self._qos,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            self._kind, self.topic, self._callback, self._qos, event_callbacks=SILENT
         )
         how = "best effort, as its publisher" if wanted == BEST_EFFORT else "reliably"
         self._node.get_logger().info(f"{self.topic} is heard {how}.")
@@ -216,7 +205,6 @@ class Dropped:
     def __init__(self, node: Node, cure: str) -> None:
         self._node, self._cure = node, cure
         self.counts: dict[str, int] = {}
-        self._warned: set[str] = set()
         self._last: dict[str, int] = {}
 
     def came(self, name: str, info: Mapping[str, Any]) -> None:
@@ -227,15 +215,10 @@ class Dropped:
         last = self._last.get(name)
         self._last[name] = number
         # a lower number comes from another publisher
-        if last is not None and number - last > 1:
-            self._note_missing(name, number - last - 1)
-
-    def _note_missing(self, name: str, missing: int) -> None:
-        topic = self._node.resolve_topic_name(name)
-        if self._node.count_publishers(topic) > 1:
+        missing = 0 if last is None else number - last - 1
+        if missing <= 0 or self._node.count_publishers(topic := self._node.resolve_topic_name(name)) > 1:
             return
-        if name not in self._warned:
-            self._warned.add(name)
+        if name not in self.counts:
             self._node.get_logger().warning(
                 f"{topic}: {missing} messages were dropped on the way: {self._cure}"
             )

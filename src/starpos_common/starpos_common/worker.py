@@ -9,9 +9,8 @@ from typing import Any
 
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.task import Future
 
-from starpos.session.driver import Outcome, outcome_of
+from starpos.session.driver import Jobs, Outcome, outcome_of
 
 
 class Worker:
@@ -91,28 +90,20 @@ class Worker:
             self._done()
 
 
-class JobRunner:
-    """Runs one job at a time and gives its outcome back in the node's executor.
+class JobRunner(Jobs):
+    """Runs jobs in a thread; their outcomes come in the node's executor.
 
-    then: called when the outcome has been delivered.
+    then: called when an outcome has been delivered.
     """
 
     def __init__(self, node: Node, then: Callable[[], object] = lambda: None) -> None:
-        self._node, self._then = node, then
+        super().__init__()
+        self._node, self._done = node, then
         self._ended = node.create_guard_condition(self._on_ended)
-        self._future: Future | None = None
-        self._outcome: Outcome | None = None
+        self._outcome = Outcome()
 
-    @property
-    def busy(self) -> bool:
-        return self._future is not None
-
-    def run(self, job: Callable[[], Any]) -> Future:
-        """Start a job and return the Future of its Outcome. Must not be called while a job runs."""
-        assert self._future is None
-        self._future = Future()
+    def _begin(self, job: Callable[[], Any]) -> None:
         threading.Thread(target=self._work, args=(job,), daemon=True).start()
-        return self._future
 
     def _work(self, job: Callable[[], Any]) -> None:
         self._outcome = outcome_of(job, self._node.get_logger().error)
@@ -121,7 +112,5 @@ class JobRunner:
             self._ended.trigger()
 
     def _on_ended(self) -> None:
-        future, self._future = self._future, None
-        assert future is not None
-        future.set_result(self._outcome)
-        self._then()
+        self._end(self._outcome)
+        self._done()

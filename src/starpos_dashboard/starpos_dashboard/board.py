@@ -174,12 +174,6 @@ def light(status: DiagnosticStatus, name: str) -> dict:
     }
 
 
-def silence(node: str) -> dict:
-    """Make the light of a node that has said nothing yet; otherwise an all-green page might lack the solver."""
-    name = text(node, NAME_LETTERS)
-    return {"name": name, "level": STALE, "sentence": "nothing heard yet"}
-
-
 # Seconds before and after now for which the Sun's way is shown, and its interval.
 SUN_WAY_S, SUN_STEP_S = 12 * 3600, 1200
 
@@ -320,8 +314,10 @@ class Board:
             name: {**what, "age": now - since} for name, (since, what) in self._heard.items()
         }
         lights = [{**light, "age": now - since} for since, light in self._lights.values()]
+        # A node that has said nothing yet has a light, too; otherwise an all-green page might lack the solver.
         silent = self._nodes - {_node_of(name) for name in self._lights}
-        lights += [{**silence(node), "age": now - self._since} for node in silent]
+        unheard = {"level": STALE, "sentence": "nothing heard yet", "age": now - self._since}
+        lights += [{"name": text(node, NAME_LETTERS), **unheard} for node in silent]
         told["sun"] = self._sun(now_s)
         told["lights"] = sorted(lights, key=lambda light: light["name"])
         told["now"] = now_s

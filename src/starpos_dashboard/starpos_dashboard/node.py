@@ -120,8 +120,6 @@ class DashboardNode(Node):
             self._board.only_lights_of(names(self._values["lights"]))
         self._server.clients = self._values["clients"]
 
-    # messages --------------------------------------------------------------------------------------------------------
-
     def _on_image(self, message: Image) -> None:
         self._image = message
 
@@ -147,7 +145,7 @@ class DashboardNode(Node):
         elif not looking and self._images is not None:
             self.destroy_subscription(self._images)
             self._images = self._image = None
-            self._server.show_frame(None)
+            self._server.frame = None
             self._board.hide_frame()
 
     def _subscribe_frames(self) -> Subscription:
@@ -159,10 +157,9 @@ class DashboardNode(Node):
         self._shown += 1
         trouble = ""
         try:
-            self._server.show_frame(jpeg(image, self._values["image_side"]))
+            self._server.frame = jpeg(image, self._values["image_side"])
         except FrameError as e:
-            trouble = str(e)
-            self._server.show_frame(None)
+            trouble, self._server.frame = str(e), None
         self._board.show_frame(self._shown, stamp_to_unix(image.header.stamp), trouble)
 
     # diagnostics -----------------------------------------------------------------------------------------------------

@@ -17,7 +17,6 @@ import threading
 import weakref
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
@@ -104,15 +103,6 @@ class DashboardError(StarposError):
     """The page cannot be served."""
 
 
-@dataclass(eq=False)
-class OpenPage:
-    """A page that is open. `looks`: it shows the frame; `sent`: number of the last fix that was sent to it."""
-
-    looks: bool
-    news: asyncio.Event = field(default_factory=asyncio.Event)
-    sent: int = 0
-
-
 def listen(address: str, port: int) -> list[socket.socket]:
     """Bind the sockets; DashboardError that says what to do if they cannot be bound."""
     try:
@@ -163,7 +153,7 @@ class DashboardServer:
         self.frame: bytes | None = None
         self.state = ""
         self.track: Track = ()
-        self.open: set[OpenPage] = set()
+        self.open: set[Events] = set()
         self.trouble = ""
         self._sockets = sockets
         self._thread = threading.Thread(target=self._run, name="dashboard", daemon=True)
@@ -196,9 +186,6 @@ class DashboardServer:
         """Send the newest state (JSON), and the part of the track that a page does not have yet."""
         self.state, self.track = state, track
         self._call(self._wake)
-
-    def show_frame(self, jpeg: bytes | None) -> None:
-        self.frame = jpeg
 
     def stop(self) -> None:
         """Close every connection and end the thread."""
@@ -346,9 +333,12 @@ class FrameReply(Reply):
 
 
 class Events(Reply):
-    """Sends state and track as they change."""
+    """Sends state and track as they change, to a page that is open."""
 
-    _page: OpenPage | None = None
+    def initialize(self) -> None:
+        self.news = asyncio.Event()
+        # Whether the page shows the frame, and the number of the last fix that was sent to it.
+        self.looks, self._sent_fix = self.request.query == "frame", 0
 
     def head(self) -> None:
         self.set_header("Content-Type", "text/event-stream")
@@ -360,25 +350,23 @@ class Events(Reply):
             self.server.refused += 1
             self.write(f"event: full\ndata: {self.server.clients}\n\n")
             return
-        self._page = page = OpenPage(looks=self.request.query == "frame")
-        self.server.open.add(page)
+        self.server.open.add(self)
         try:
             while await self.deliver():
-                await page.news.wait()
-                page.news.clear()
-                self._write_news(page)
+                await self.news.wait()
+                self.news.clear()
+                self._write_news()
         finally:
-            self.server.open.discard(page)
+            self.server.open.discard(self)
 
-    def _write_news(self, page: OpenPage) -> None:
-        points = [p for p in self.server.track if p[0] > page.sent]
+    def _write_news(self) -> None:
+        points = [p for p in self.server.track if p[0] > self._sent_fix]
         if points:
-            whole = {"begin": page.sent == 0, "points": points}
+            whole = {"begin": self._sent_fix == 0, "points": points}
             self.write(f"event: track\ndata: {json.dumps(whole, separators=(',', ':'))}\n\n")
-            page.sent = points[-1][0]
+            self._sent_fix = points[-1][0]
         self.write(f"event: state\ndata: {self.server.state}\n\n")
 
     def on_connection_close(self) -> None:
-        if self._page:
-            # The page's loop wakes up, cannot deliver, and ends.
-            self._page.news.set()
+        # The page's loop wakes up, cannot deliver, and ends.
+        self.news.set()

@@ -179,10 +179,10 @@ def test_frames_are_wanted_only_while_a_page_shows_them(server):
 
 
 def test_the_newest_frame_is_served_and_gone_when_it_is_taken_away(server):
-    server.show_frame(b"\xff\xd8jpeg")
+    server.frame = b"\xff\xd8jpeg"
     status, headers, body = ask(server, "/frame.jpg?7")
     assert (status, body) == (200, b"\xff\xd8jpeg") and headers["Cache-Control"] == "no-store"
-    server.show_frame(None)
+    server.frame = None
     assert ask(server, "/frame.jpg")[0] == 404
 
 

@@ -11,6 +11,7 @@ import struct
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from http.client import HTTPConnection, HTTPException, HTTPResponse
 from itertools import count
 from typing import Any, TypeVar
@@ -21,7 +22,7 @@ import numpy as np
 from starpos.errors import one_line
 from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource
-from starpos_camera.sources.timing import check_exposed, clock_stddev_of, stamp_of
+from starpos_camera.sources.timing import clock_stddev_of, dated_by_driver
 
 T = TypeVar("T")
 DEFAULT_EXPOSURE_S = 0.5
@@ -42,7 +43,6 @@ NOT_THERE = 0x400, 0x40B
 CALL_S, PICTURE_S, STALL_S = 5.0, 60.0, 5.0
 # Most bytes of an answer, and of a picture's metadata.
 MAX_REPLY, MAX_METADATA = 1_000_000, 65536
-CHUNK = 1 << 20
 METADATA = struct.Struct("<4i7i")
 # The types of the standard that pixels may have.
 SENT_AS = {1: "<i2", 2: "<i4", 6: "u1", 8: "<u2", 9: "<u4"}
@@ -158,15 +158,11 @@ def _decode(stream: HTTPResponse, width: int, height: int) -> np.ndarray:
         )
     stream.read(begin - METADATA.size)
     pixels = np.empty((width, height), SENT_AS[sent_as])
-    room, at = pixels.data.cast("B"), 0
-    while at < len(room):
-        piece = stream.read(min(CHUNK, len(room) - at))
-        if not piece:
-            raise CaptureError(f"a picture ended after {at} of {len(room)} bytes.")
-        room[at : at + len(piece)] = piece
-        at += len(piece)
+    came = stream.readinto(pixels.data.cast("B"))
+    if came < pixels.nbytes:
+        raise CaptureError(f"a picture ended after {came} of {pixels.nbytes} bytes.")
     if stream.read(1):
-        raise CaptureError(f"a picture has more than its {len(room)} bytes.")
+        raise CaptureError(f"a picture has more than its {pixels.nbytes} bytes.")
     # The standard's order is [x][y].
     return pixels.T
 
@@ -207,14 +203,8 @@ class Alpaca(DeviceSource[AlpacaCamera]):
         width, height = int(camera.get("cameraxsize")), int(camera.get("cameraysize"))
         if min(width, height) < 1 or width * height > MAX_PIXELS:
             raise CaptureError(f"its sensor of {width} x {height} px is not valid.")
-        for member, value in {
-            "BinX": 1,
-            "BinY": 1,
-            "StartX": 0,
-            "StartY": 0,
-            "NumX": width,
-            "NumY": height,
-        }.items():
+        whole = {"BinX": 1, "BinY": 1, "StartX": 0, "StartY": 0, "NumX": width, "NumY": height}
+        for member, value in whole.items():
             camera.put(member.lower(), **{member: value})
         self._size, self._pattern, self._gain = (width, height), _pattern(camera), None
         return camera
@@ -230,13 +220,12 @@ class Alpaca(DeviceSource[AlpacaCamera]):
         self._wait(camera, wanted_s)
         ready_s = self._now()
         exposure_s = camera.optional("lastexposureduration", wanted_s)
-        check_exposed(exposure_s, wanted_s, commanded_s, ready_s)
         pixels = camera.picture(*self._size)
         told = camera.optional("lastexposurestarttime", "")
         clock_s = clock_stddev_of("alpaca", self._address.rpartition(":")[0], self._values)
-        stamp = stamp_of(told, clock_s, exposure_s, commanded_s, ready_s, self._values)
-        frame = Frame(_unsigned(pixels), pattern=self._pattern, exposure_s=exposure_s)
-        return stamp.captured(frame, self.hardware_id, remark)
+        frame, exposures_s = Frame(_unsigned(pixels), pattern=self._pattern), (exposure_s, wanted_s)
+        taken = dated_by_driver(frame, told, clock_s, exposures_s, (commanded_s, ready_s), self._values)
+        return replace(taken, remark=taken.remark or remark)
 
     def _explain(self, error: Exception) -> str:
         if isinstance(error, CaptureError):

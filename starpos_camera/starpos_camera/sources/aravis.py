@@ -9,18 +9,18 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.util import find_spec
+from string import digits
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-
 from starpos.errors import StarposError, one_line
+from starpos.frames.encodings import MOSAICS
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import MAX_PIXELS, Frame
-from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource
-from starpos_camera.sources.timing import Stamp, middle_of_commanded, middle_of_started
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, decoded
+from starpos_camera.sources.timing import dated, middle_of_commanded, middle_of_started
 from starpos_interfaces.msg import Capture
 
 # Between a camera's time and the moment of the light, where the clocks are related.
@@ -29,76 +29,63 @@ TIMESTAMP_STDDEV_S = 1e-3
 TOLERANCE_S = 5e-3
 
 
-@dataclass(frozen=True)
-class FrameTimes:
-    """What is known of the time of one frame; all but camera_s in Unix seconds of the node's clock.
+def on_host_clock(
+    camera_s: float,
+    relation: tuple[float, float] | None,
+    exposure_s: float,
+    commanded_s: float | None,
+    received_s: float,
+) -> tuple[float, float] | None:
+    """The camera's time of a frame on the node's clock (Unix s), and its error (s); None: the clocks are not related.
 
-    commanded_s  time just before the software trigger; None: a line has triggered
-    received_s   arrival of the frame's first or last data
-    camera_s     the frame's time on the camera's clock; None: not reported
-    relation     host's clock minus camera's clock and its standard deviation, s; None: the camera's cannot be read
+    relation: of `clock_relation`; the other times are `stamp_of_camera`'s. A camera whose clock cannot be read may keep
+    UTC (PTP), but its error is not stated. Exposure and stamp then lie anywhere between trigger and arrival.
     """
+    if relation is not None:
+        return camera_s + relation[0], relation[1]
+    if commanded_s is None or not commanded_s <= camera_s <= received_s + TOLERANCE_S:
+        return None
+    return camera_s, max(0.0, received_s - commanded_s - exposure_s) / math.sqrt(3)
 
-    exposure_s: float
-    commanded_s: float | None
-    received_s: float
-    camera_s: float | None
-    relation: tuple[float, float] | None
 
+def stamp_of_camera(
+    frame: Frame,
+    at: tuple[float, float] | None,
+    exposure_s: float,
+    commanded_s: float | None,
+    received_s: float,
+    values: Mapping,
+) -> CapturedFrame:
+    """Date a frame by the better time: the camera's, or that of command or arrival.
 
-def stamp_of_camera(times: FrameTimes, moment: str, values: Mapping) -> Stamp:
-    """Choose the better stamp: from the camera's time, or from command or arrival alone.
-
-    moment: start, end or unknown: the moment of the exposure that the camera's times are of.
+    at           of `on_host_clock`; None: not known
+    commanded_s  Unix time just before the software trigger; None: a line has triggered
+    received_s   arrival of the frame's first or last data, Unix time
     """
-    otherwise = _by_host(times, values)
-    if times.camera_s is None:
+    frame, half_s = replace(frame, exposure_s=exposure_s), exposure_s / 2
+    if commanded_s is None:
+        middle = middle_of_started(received_s - exposure_s, 0.0, exposure_s, values)
+        otherwise = dated(frame, *middle, Capture.DRIVER)
+    else:
+        otherwise = dated(frame, *middle_of_commanded(commanded_s, exposure_s, values), Capture.COMMAND)
+    if at is None:
         return otherwise
-    at_s, stddev_s = _on_host_clock(times)
-    if math.isnan(at_s):
-        return otherwise
-    earliest_s = -math.inf if times.commanded_s is None else times.commanded_s - TOLERANCE_S
-    half_s = times.exposure_s / 2
-    middles_s = {"start": at_s + half_s, "end": at_s - half_s}
-    possible = [
-        name
-        for name, mid_s in middles_s.items()
-        if mid_s - half_s >= earliest_s and mid_s + half_s <= times.received_s + TOLERANCE_S
+    at_s, stddev_s = at[0], math.hypot(at[1], TIMESTAMP_STDDEV_S)
+    earliest_s = (-math.inf if commanded_s is None else commanded_s) + half_s - TOLERANCE_S
+    latest_s = received_s - half_s + TOLERANCE_S
+    middles_s = [
+        mid_s
+        for moment, mid_s in (("start", at_s + half_s), ("end", at_s - half_s))
+        if values["aravis.timestamp"] in (moment, "unknown") and earliest_s <= mid_s <= latest_s
     ]
-    wanted = [name for name in possible if moment in (name, "unknown")]
-    if not wanted:
-        told = "its times of frames contradict trigger and arrival, and are not used"
+    if not middles_s:
+        told = "its times of frames contradict trigger and arrival, and are not used."
         return replace(otherwise, remark=told)
-    middle_s = sum(middles_s[name] for name in wanted) / len(wanted)
-    if len(wanted) > 1:
+    if len(middles_s) > 1:
         stddev_s = math.hypot(stddev_s, half_s)
-    if stddev_s > otherwise.stddev_s:
+    if stddev_s > otherwise.frame.stamp_stddev_s:
         return otherwise
-    return Stamp(middle_s, stddev_s, Capture.HARDWARE)
-
-
-def _by_host(times: FrameTimes, values: Mapping) -> Stamp:
-    """Stamp from the command, or from the arrival of a frame that a line has triggered."""
-    if times.commanded_s is not None:
-        return Stamp(*middle_of_commanded(times.commanded_s, times.exposure_s, values), Capture.COMMAND)
-    start_s = times.received_s - times.exposure_s
-    return Stamp(*middle_of_started(start_s, 0.0, times.exposure_s, values), Capture.DRIVER)
-
-
-def _on_host_clock(times: FrameTimes) -> tuple[float, float]:
-    """The camera's time of a frame on the host's clock, and its standard deviation (s); NaN: the clocks are not related.
-
-    A camera whose clock cannot be read may keep UTC (PTP), but its error is not stated. Exposure and stamp then lie
-    anywhere between trigger and arrival: the error is the one of a stamp at either edge.
-    """
-    assert times.camera_s is not None
-    if times.relation is not None:
-        offset_s, stddev_s = times.relation
-        return times.camera_s + offset_s, math.hypot(stddev_s, TIMESTAMP_STDDEV_S)
-    if times.commanded_s is None or not times.commanded_s <= times.camera_s <= times.received_s + TOLERANCE_S:
-        return math.nan, math.nan
-    slack_s = max(0.0, times.received_s - times.commanded_s - times.exposure_s)
-    return times.camera_s, math.hypot(slack_s / math.sqrt(3), TIMESTAMP_STDDEV_S)
+    return dated(frame, sum(middles_s) / len(middles_s), stddev_s, Capture.HARDWARE)
 
 
 # Buffers that wait for frames.
@@ -107,35 +94,20 @@ BUFFERS = 4
 EXPOSURE_TOLERANCE = 0.01
 # A clock is read so often, and the quickest reading counts.
 CLOCK_READINGS = 5
-BITS = {"16": 16, "14": 14, "12": 12, "10": 10, "8": 8}
-PATTERNS = {"RG": "rggb", "GR": "grbg", "GB": "gbrg", "BG": "bggr"}
-# Names of unpacked formats (GenICam's Pixel Format Naming Convention): Bayer's pattern, '' for grey, and bits.
-FORMATS = {f"Mono{name}": ("", bits) for name, bits in BITS.items()} | {
-    f"Bayer{letters}{name}": (pattern, bits)
-    for name, bits in BITS.items()
-    for letters, pattern in PATTERNS.items()
+# The formats that are read, by their names in GenICam's Pixel Format Naming Convention: encoding and bits.
+FORMATS = {
+    name: (encoding + ("8" if bits == 8 else "16"), bits)
+    for bits in (8, 10, 12, 14, 16)
+    for name, encoding in (
+        (f"Mono{bits}", "mono"),
+        *((f"Bayer{p[:2].upper()}{bits}", f"bayer_{p}") for p in MOSAICS),
+    )
 }
 # The commands that hold a clock, the features with what was held, and with the ticks of a second ('' for 1e9).
 CLOCKS = (
     ("TimestampLatch", "TimestampLatchValue", ""),
     ("GevTimestampControlLatch", "GevTimestampValue", "GevTimestampTickFrequency"),
 )
-
-
-@dataclass(frozen=True, eq=False)
-class ArrivedFrame:
-    """A frame as it came.
-
-    pixels      (height, width) uint8 or uint16
-    pattern     of its mosaic; '' for none
-    camera_s    its time on the camera's clock; None: not reported
-    received_s  its arrival, Unix time by the system's clock
-    """
-
-    pixels: np.ndarray
-    pattern: str
-    camera_s: float | None
-    received_s: float
 
 
 def library() -> ModuleType:
@@ -157,8 +129,8 @@ class AravisCamera:
         self._exposure_s: float | None = None
         self._gain: float | None = None
         self._size = self._set_region(values["aravis.region_as_set"])
-        self._pattern, self._bits = self._set_format(values["aravis.pixel_format"])
-        self.shutter = self._shutter()
+        self._encoding = self._set_format(values["aravis.pixel_format"])
+        self._shutter = self._find_shutter()
         self.camera.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
         self.camera.set_trigger(values["aravis.trigger"])
         self._stream = self.camera.create_stream(None, None)
@@ -186,7 +158,7 @@ class AravisCamera:
         if not (math.isfinite(told_s) and told_s > 0):
             raise CaptureError(f"it says that its exposure is {told_s:g} s.")
         if wanted_s is not None and abs(told_s - wanted_s) > EXPOSURE_TOLERANCE * wanted_s:
-            return told_s, f"it exposes for {told_s:g} s, not for {wanted_s:g} s"
+            return told_s, f"it exposes for {told_s:g} s, not for {wanted_s:g} s."
         return told_s, ""
 
     def set_gain(self, wanted: float | None) -> str:
@@ -201,7 +173,7 @@ class AravisCamera:
             self._gain = wanted
         told = camera.get_gain()
         return (
-            "" if abs(told - wanted) <= 0.01 * max(1.0, wanted) else f"its gain is {told:g}, not {wanted:g}"
+            "" if abs(told - wanted) <= 0.01 * max(1.0, wanted) else f"its gain is {told:g}, not {wanted:g}."
         )
 
     def trigger(self) -> None:
@@ -212,8 +184,11 @@ class AravisCamera:
         while (buffer := self._stream.try_pop_buffer()) is not None:
             self._stream.push_buffer(buffer)
 
-    def pop(self, patience_s: float) -> ArrivedFrame | None:
-        """Take the next frame; None if none comes in time. CaptureError if it is incomplete."""
+    def pop(self, patience_s: float) -> tuple[Frame, float | None, float] | None:
+        """Take the next frame; None if none comes in time. CaptureError if it is incomplete.
+
+        With it come its time on the camera's clock (s), None if it has none, and its arrival, Unix time of the system.
+        """
         buffer = self._stream.timeout_pop_buffer(round(1e6 * patience_s))
         if buffer is None:
             return None
@@ -222,7 +197,7 @@ class AravisCamera:
         finally:
             self._stream.push_buffer(buffer)
 
-    def _read(self, buffer: Any) -> ArrivedFrame:
+    def _read(self, buffer: Any) -> tuple[Frame, float | None, float]:
         if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:
             raise CaptureError(f"a frame is incomplete ({buffer.get_status().value_nick}).")
         size = buffer.get_image_width(), buffer.get_image_height()
@@ -230,13 +205,9 @@ class AravisCamera:
             raise CaptureError(
                 f"a frame has {size[0]} x {size[1]} px, not {self._size[0]} x {self._size[1]}."
             )
-        camera_ns = buffer.get_timestamp()
-        return ArrivedFrame(
-            pixels=pixels_of(buffer.get_data(), self._size, self._bits),
-            pattern=self._pattern,
-            camera_s=camera_ns * 1e-9 if camera_ns else None,
-            received_s=buffer.get_system_timestamp() * 1e-9,
-        )
+        pixels, pattern = decoded(self._encoding, buffer.get_data(), self._size)
+        frame, camera_ns = Frame(pixels, pattern=pattern, shutter=self._shutter), buffer.get_timestamp()
+        return frame, camera_ns * 1e-9 if camera_ns else None, buffer.get_system_timestamp() * 1e-9
 
     def _set_region(self, as_set: bool) -> tuple[int, int]:
         """Set the whole sensor, unless its present region is meant; return width and height (px)."""
@@ -256,8 +227,8 @@ class AravisCamera:
             raise CaptureError(f"frames of {region.width} x {region.height} px cannot be used.")
         return region.width, region.height
 
-    def _set_format(self, wanted: str) -> tuple[str, int]:
-        """Set the pixel format; return its pattern and bits."""
+    def _set_format(self, wanted: str) -> str:
+        """Set the pixel format; return its encoding."""
         offered = self.camera.dup_available_pixel_formats_as_strings()
         if wanted and (wanted not in FORMATS or wanted not in offered):
             raise CaptureError(
@@ -266,9 +237,9 @@ class AravisCamera:
             )
         name = wanted or best_format(offered, self.camera.get_pixel_format_as_string())
         self.camera.set_pixel_format_from_string(name)
-        return FORMATS[name]
+        return FORMATS[name][0]
 
-    def _shutter(self) -> Shutter | None:
+    def _find_shutter(self) -> Shutter | None:
         """A global shutter where the camera says that it has one; else nothing is known."""
         name = "SensorShutterMode"
         if self.camera.is_feature_available(name) and self.camera.get_string(name) == "Global":
@@ -294,10 +265,10 @@ def best_format(offered: list[str], present: str) -> str:
     several patterns has only one at a time, so those other than the present format's are no choice.
     """
     known = [name for name in offered if name in FORMATS]
-    mosaics = [name for name in known if FORMATS[name][0]]
-    patterns = {FORMATS[name][0] for name in mosaics}
+    mosaics = [name for name in known if name.startswith("Bayer")]
+    patterns = {name.rstrip(digits) for name in mosaics}
     if len(patterns) > 1:
-        known = [name for name in known if FORMATS[name][0] == FORMATS.get(present, ("", 0))[0]]
+        known = [name for name in known if name.rstrip(digits) == present.rstrip(digits)]
     elif mosaics:
         known = mosaics
     if not known:
@@ -305,16 +276,6 @@ def best_format(offered: list[str], present: str) -> str:
             f"it offers {' '.join(offered)}; this source knows unpacked Mono and Bayer formats."
         )
     return max(known, key=lambda name: FORMATS[name][1])
-
-
-def pixels_of(data: bytes, size: tuple[int, int], bits: int) -> np.ndarray:
-    """Convert a buffer to pixels, (height, width) uint8 or uint16; CaptureError if it has another length."""
-    width, height = size
-    kind = np.dtype("u1" if bits == 8 else "<u2")
-    if len(data) != width * height * kind.itemsize:
-        raise CaptureError(f"a frame has {len(data)} bytes instead of {width * height * kind.itemsize}.")
-    pixels = np.frombuffer(data, kind).reshape(height, width)
-    return pixels.astype(kind.newbyteorder("="), copy=False)
 
 
 def clock_relation(camera: Any, now: Callable[[], float]) -> tuple[float, float] | None:
@@ -381,30 +342,27 @@ class Aravis(DeviceSource[AravisCamera]):
         asked_s, commanded_s = time.time(), self._now()
         if triggers:
             camera.trigger()
-        buffer = self._wait(camera, asked_s, exposure_s)
+        frame, camera_s, arrival_s = self._wait(camera, asked_s, exposure_s)
         # The arrival by the node's clock, which need not be the system's.
-        received_s = self._now() - (time.time() - buffer.received_s)
-        times = FrameTimes(
-            exposure_s=exposure_s,
-            commanded_s=commanded_s if triggers else None,
-            received_s=received_s,
-            camera_s=buffer.camera_s,
-            relation=clock_relation(camera.camera, self._now),
-        )
-        stamp = stamp_of_camera(times, self._values["aravis.timestamp"], self._values)
-        frame = Frame(buffer.pixels, pattern=buffer.pattern, exposure_s=exposure_s, shutter=camera.shutter)
-        return stamp.captured(frame, self.hardware_id, remark and f"{remark}.")
+        received_s = self._now() - (time.time() - arrival_s)
+        times = exposure_s, commanded_s if triggers else None, received_s
+        relation = clock_relation(camera.camera, self._now)
+        at = None if camera_s is None else on_host_clock(camera_s, relation, *times)
+        taken = stamp_of_camera(frame, at, *times, self._values)
+        return replace(taken, remark=taken.remark or remark)
 
-    def _wait(self, camera: AravisCamera, asked_s: float, exposure_s: float) -> Any:
-        """Wait for a frame that was exposed after `asked_s` (Unix time of the system)."""
+    def _wait(
+        self, camera: AravisCamera, asked_s: float, exposure_s: float
+    ) -> tuple[Frame, float | None, float]:
+        """Wait for a frame that was exposed after `asked_s` (Unix time of the system); as `AravisCamera.pop` gives it."""
         end_s = time.monotonic() + exposure_s + READOUT_S
         while time.monotonic() < end_s:
             if self._closing.is_set():
                 raise CaptureError("the node ends.")
-            buffer = camera.pop(WATCH_S)
+            arrived = camera.pop(WATCH_S)
             # A frame that arrived before its exposure can have ended is an older one.
-            if buffer is not None and buffer.received_s >= asked_s + exposure_s:
-                return buffer
+            if arrived is not None and arrived[2] >= asked_s + exposure_s:
+                return arrived
         source = self._values["aravis.trigger"]
         raise CaptureError(
             f"no frame has come {READOUT_S:g} s after its exposure; check the trigger ({source}) and the "

@@ -13,7 +13,7 @@ from typing import Any
 
 from starpos.frames.reading import RAW, decode_frame
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, missing
-from starpos_camera.sources.timing import middle_of_commanded
+from starpos_camera.sources.timing import dated, middle_of_commanded
 from starpos_interfaces.msg import Capture
 
 # Largest difference of an exposure or a gain from one that the camera has, as a share.
@@ -301,13 +301,12 @@ class Gphoto2(DeviceSource[Gphoto2Camera]):
         told_s = frame.exposure_s
         exposure_s = set_s if bulb or told_s is None else told_s
         if abs(math.log(exposure_s / set_s)) > TOLERANCE:
-            told = f"it says that it exposed for {exposure_s:g} s, though its shutter stood at {set_s:g} s"
-            remark = f"{self.hardware_id}: {told}."
+            remark = f"it says that it exposed for {exposure_s:g} s, though its shutter stood at {set_s:g} s."
         mid_s, stddev_s = middle_of_commanded(commanded_s, exposure_s, self._values)
         if not bulb:
             stddev_s = math.hypot(stddev_s, named_off_s(exposure_s) / 2)
-        frame = replace(frame, exposure_s=exposure_s, mid_unix_s=mid_s, stamp_stddev_s=stddev_s)
-        return CapturedFrame(frame, Capture.COMMAND, remark=remark)
+        taken = dated(replace(frame, exposure_s=exposure_s), mid_s, stddev_s, Capture.COMMAND)
+        return replace(taken, remark=remark)
 
     def _delete(self, camera: Gphoto2Camera, files: list[str]) -> str:
         """Delete the files of this exposure in the camera; return a sentence if that failed, otherwise ''."""
@@ -316,7 +315,7 @@ class Gphoto2(DeviceSource[Gphoto2Camera]):
         try:
             camera.delete(files)
         except gphoto2.GPhoto2Error as error:
-            return f"{self.hardware_id}: frames stay in the camera, which fills up ({error.string})."
+            return f"frames stay in the camera, which fills up ({error.string})."
         return ""
 
 

@@ -11,14 +11,14 @@ import xml.etree.ElementTree as ET
 import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from starpos.errors import one_line
 from starpos.frames.fits import decode_fits
 from starpos.frames.frame import MAX_PIXELS
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource
-from starpos_camera.sources.timing import check_exposed, clock_stddev_of, stamp_of
+from starpos_camera.sources.timing import clock_stddev_of, dated_by_driver
 
 # A server that has gone is noticed after two of these.
 BEAT_S = 0.5
@@ -29,27 +29,23 @@ BLOB_MAX = 4 * MAX_PIXELS
 ELEMENT_MAX = 2 * BLOB_MAX
 
 
-@dataclass(frozen=True, eq=False)
-class Blob:
-    """Content of a BLOB vector: bytes, and their format and size as the driver states them (size before compression)."""
-
-    data: bytes
-    size: int
-    format: str
-
-
 @dataclass
 class Vector:
-    """A property of a device: kind (Switch, Number, Text ...), state, texts of its members and limits of its numbers.
+    """A property of a device: kind (Switch, Number, Text ...), texts of its members and limits of its numbers.
 
+    state: Idle, Ok, Busy or Alert; '' of one that the device does not have.
     asked: whether it was set, and the device has not answered yet.
     """
 
-    kind: str
-    state: str
+    kind: str = ""
+    state: str = ""
     members: dict[str, str] = field(default_factory=dict)
     limits: dict[str, tuple[str | None, str | None]] = field(default_factory=dict)
     asked: bool = False
+
+    def number(self, member: str) -> float | None:
+        """Value of a member; None without one."""
+        return _number(self.members.get(member))
 
 
 class IndiDevice:
@@ -69,10 +65,10 @@ class IndiDevice:
             ) from None
         self.lost = False
         # The newest one.
-        self.blob: Blob | None = None
+        self.blob: ET.Element | None = None
         # Names of the devices that are there.
         self.there: set[str] = set()
-        self._vectors: dict[str, Vector] = {}
+        self.vectors: dict[str, Vector] = {}
         self._message = ""
         # How often the device has defined CONNECTION since it came or was disconnected.
         self._definitions = 0
@@ -111,33 +107,9 @@ class IndiDevice:
             self._ask(device=self.name, name="CONNECTION")
         return self.until(lambda: self._definitions > 1, seconds)
 
-    def has(self, vector: str) -> bool:
-        return vector in self._vectors
-
-    def state(self, vector: str) -> str | None:
-        """Idle, Ok, Busy or Alert; None without such a vector."""
-        found = self._vectors.get(vector)
-        return None if found is None else found.state
-
-    def answered(self, vector: str) -> bool:
-        """Whether the device has answered since the vector was set."""
-        found = self._vectors.get(vector)
-        return found is not None and not found.asked
-
-    def value(self, vector: str, member: str) -> str | None:
-        """Text of a member; None without one."""
-        found = self._vectors.get(vector)
-        return None if found is None else found.members.get(member)
-
-    def number(self, vector: str, member: str) -> float | None:
-        """Value of a member as a number; None without one."""
-        return _number(self.value(vector, member))
-
-    def limits(self, vector: str, member: str) -> tuple[float | None, float | None]:
-        """Smallest and largest allowed value of a number; None where the device states none."""
-        found = self._vectors.get(vector)
-        low, high = (None, None) if found is None else found.limits.get(member, (None, None))
-        return _number(low), _number(high)
+    def vector(self, name: str) -> Vector:
+        """A vector as it is now; an empty one where the device has none."""
+        return self.vectors.get(name) or Vector()
 
     def last_message(self) -> str:
         """Last message of the device since `forget`, in brackets; "" without one."""
@@ -149,7 +121,7 @@ class IndiDevice:
 
     def send(self, vector: str, **members: str) -> None:
         """Set members of a vector, which is Busy until the device answers; does nothing if the device has gone."""
-        found = self._vectors.get(vector)
+        found = self.vectors.get(vector)
         if found is None:
             return
         element = ET.Element(f"new{found.kind}Vector", device=self.name, name=vector)
@@ -216,20 +188,20 @@ class IndiDevice:
             return
         self._message = element.get("message", self._message)
         if kind == "delProperty":
-            for gone in [name] if name else list(self._vectors):
-                self._vectors.pop(gone, None)
+            for gone in [name] if name else list(self.vectors):
+                self.vectors.pop(gone, None)
             if name in ("", "CCD1"):
                 # The device has gone, or was disconnected.
                 self._definitions = 0
         elif kind.startswith("def"):
-            self._vectors[name] = Vector(
+            self.vectors[name] = Vector(
                 kind=kind[3:].removesuffix("Vector"),
                 state=element.get("state", "Idle"),
                 members={m.get("name", ""): (m.text or "").strip() for m in element},
                 limits={m.get("name", ""): (m.get("min"), m.get("max")) for m in element},
             )
             self._definitions += name == "CONNECTION"
-        elif kind.startswith("set") and (vector := self._vectors.get(name)) is not None:
+        elif kind.startswith("set") and (vector := self.vectors.get(name)) is not None:
             vector.state = element.get("state", vector.state)
             if vector.asked and vector.state == "Busy":
                 # It begins now: a frame that has come is of an exposure before.
@@ -237,17 +209,9 @@ class IndiDevice:
             vector.asked = False
             for m in element:
                 if m.tag == "oneBLOB":
-                    self.blob = _blob(m)
+                    self.blob = m
                 else:
                     vector.members[m.get("name", "")] = (m.text or "").strip()
-
-
-def _blob(member: ET.Element) -> Blob:
-    try:
-        data, size = base64.b64decode(member.text or ""), int(member.get("size", ""))
-    except (binascii.Error, ValueError) as error:
-        raise CaptureError(f"its frame is no BLOB ({one_line(error)}).") from None
-    return Blob(data, size, member.get("format", ""))
 
 
 def _number(text: str | None) -> float | None:
@@ -275,7 +239,7 @@ GAINS = (("CCD_GAIN", "GAIN"), ("CCD_CONTROLS", "Gain"))
 
 def check_there(device: IndiDevice) -> None:
     """Wait for the device; CaptureError if it does not come."""
-    if not device.until(lambda: device.has("CONNECTION"), ANSWER_S):
+    if not device.until(lambda: "CONNECTION" in device.vectors, ANSWER_S):
         there = ", ".join(map(one_line, sorted(device.there))) or "nothing"
         raise CaptureError(f"the server has {there}: start the camera's driver, or correct indi.device.")
 
@@ -284,22 +248,22 @@ def connect_camera(device: IndiDevice) -> None:
     """Make the driver open its camera; another client may have done so already."""
 
     def connected() -> bool:
-        return device.value("CONNECTION", "CONNECT") == "On"
+        return device.vector("CONNECTION").members.get("CONNECT") == "On"
 
     def refused() -> bool:
-        return device.state("CONNECTION") == "Alert"
+        return device.vector("CONNECTION").state == "Alert"
 
     device.forget()
     if not connected():
         device.send("CONNECTION", CONNECT="On")
-    wanted = ("CCD_EXPOSURE", "CCD_INFO", "CCD1")
-    device.until(lambda: refused() or (connected() and all(device.has(v) for v in wanted)), CONNECT_S)
+    wanted = {"CCD_EXPOSURE", "CCD_INFO", "CCD1"}
+    device.until(lambda: refused() or (connected() and wanted <= device.vectors.keys()), CONNECT_S)
     if refused() or not connected() or not device.settled(ANSWER_S):
         raise CaptureError(
             f"the driver does not reach its camera{device.last_message()}: check cable and power."
         )
-    if lacks := [v for v in wanted if not device.has(v)]:
-        raise CaptureError(f"{device.name} has no {lacks[0]}, so it is no camera: correct indi.device.")
+    if lacks := wanted - device.vectors.keys():
+        raise CaptureError(f"{device.name} has no {min(lacks)}, so it is no camera: correct indi.device.")
     device.enable_blobs("CCD1")
 
 
@@ -309,24 +273,24 @@ def set_up(device: IndiDevice, exposure_s: float, gain: float | None, binning: i
     gain: None leaves it as it is.  binning: px each way.
     """
     # A client that was killed may have left an exposure.
-    if device.state("CCD_EXPOSURE") == "Busy":
+    if device.vector("CCD_EXPOSURE").state == "Busy":
         device.send("CCD_ABORT_EXPOSURE", ABORT="On")
-        device.until(lambda: device.state("CCD_EXPOSURE") != "Busy", ANSWER_S)
+        device.until(lambda: device.vector("CCD_EXPOSURE").state != "Busy", ANSWER_S)
     for vector, member in SWITCHES:
-        if device.value(vector, member) == "Off":
+        if device.vector(vector).members.get(member) == "Off":
             _set(device, vector, **{member: "On"})
-    if device.has("CCD_BINNING"):
+    if "CCD_BINNING" in device.vectors:
         _set_numbers(device, "CCD_BINNING", HOR_BIN=binning, VER_BIN=binning)
     elif binning != 1:
         raise CaptureError("it cannot bin: set indi.binning to 1.")
-    if device.has("CCD_FRAME"):
-        width, height = (device.number("CCD_INFO", f"CCD_MAX_{axis}") or 0.0 for axis in "XY")
+    if "CCD_FRAME" in device.vectors:
+        width, height = (device.vector("CCD_INFO").number(f"CCD_MAX_{axis}") or 0.0 for axis in "XY")
         if width and height:
             _set_numbers(device, "CCD_FRAME", X=0.0, Y=0.0, WIDTH=width, HEIGHT=height)
     if gain is not None:
         vector, member = _gain_of(device)
         _check_limits(device, vector, member, gain, "`gain`")
-        if device.number(vector, member) != gain:
+        if device.vector(vector).number(member) != gain:
             # The driver may round the gain to one that the camera has.
             _set(device, vector, **{member: repr(float(gain))})
     _check_limits(device, "CCD_EXPOSURE", "CCD_EXPOSURE_VALUE", exposure_s, "`exposure` (s)")
@@ -336,7 +300,7 @@ def _gain_of(device: IndiDevice) -> tuple[str, str]:
     """The vector and member that set the gain; CaptureError if none comes."""
 
     def there() -> list[tuple[str, str]]:
-        return [(v, m) for v, m in GAINS if device.value(v, m) is not None]
+        return [(v, m) for v, m in GAINS if m in device.vector(v).members]
 
     # A driver defines its properties one after the other, and nothing says which is the last.
     if not device.until(there, ANSWER_S):
@@ -344,11 +308,11 @@ def _gain_of(device: IndiDevice) -> tuple[str, str]:
     return there()[0]
 
 
-def expose(device: IndiDevice, exposure_s: float, readout_s: float) -> Blob:
+def expose(device: IndiDevice, exposure_s: float, readout_s: float) -> ET.Element:
     """Expose now and return the frame, which may take readout_s after its end; an exposure given up is aborted."""
 
-    def state() -> str | None:
-        return device.state("CCD_EXPOSURE")
+    def state() -> str:
+        return device.vector("CCD_EXPOSURE").state
 
     device.forget()
     try:
@@ -356,19 +320,19 @@ def expose(device: IndiDevice, exposure_s: float, readout_s: float) -> Blob:
 
         def ended() -> bool:
             # before the answer a frame is of an exposure that was given up
-            done = device.blob is not None and device.answered("CCD_EXPOSURE")
-            return done or state() in (None, "Alert", "Idle")
+            done = device.blob is not None and not device.vector("CCD_EXPOSURE").asked
+            return done or state() in ("", "Alert", "Idle")
 
         device.until(ended, exposure_s + readout_s)
         if device.lost:
             raise CaptureError("the INDI server went away during the exposure; it is looked for again.")
-        if state() is None:
+        if not state():
             raise CaptureError(
                 "the camera or its driver went away during the exposure; it is looked for again."
             )
-        if not device.blob:
+        if device.blob is None:
             ends = {"Alert": "failed", "Idle": "was aborted by another client"}
-            end = ends.get(state() or "", "gave no frame in time")
+            end = ends.get(state(), "gave no frame in time")
             raise CaptureError(f"the exposure {end}{device.last_message()}.")
     except BaseException:
         # This is for the node's end too.
@@ -382,27 +346,27 @@ def expose(device: IndiDevice, exposure_s: float, readout_s: float) -> Blob:
 
 def _set(device: IndiDevice, vector: str, **members: str) -> None:
     device.send(vector, **members)
-    if not device.until(lambda: device.state(vector) != "Busy", ANSWER_S):
+    if not device.until(lambda: device.vector(vector).state != "Busy", ANSWER_S):
         raise CaptureError(f"the driver does not answer to {vector}: restart it.")
-    if device.state(vector) not in ("Ok", "Idle"):
+    if device.vector(vector).state not in ("Ok", "Idle"):
         asked = ", ".join(f"{m} {v}" for m, v in members.items())
         raise CaptureError(f"the driver refuses {vector} {asked}{device.last_message()}.")
 
 
 def _set_numbers(device: IndiDevice, vector: str, **numbers: float) -> None:
     """Set the numbers that differ, and check that they were taken."""
-    wrong = {m: n for m, n in numbers.items() if device.number(vector, m) != n}
+    wrong = {m: n for m, n in numbers.items() if device.vector(vector).number(m) != n}
     if not wrong:
         return
     _set(device, vector, **{m: repr(float(n)) for m, n in numbers.items()})
     for member, number in wrong.items():
-        found = device.number(vector, member)
+        found = device.vector(vector).number(member)
         if found is None or abs(found - number) > 1e-6 * abs(number):
             raise CaptureError(f"the driver has made its {vector} {member} {found}, not {number:g}.")
 
 
 def _check_limits(device: IndiDevice, vector: str, member: str, value: float, name: str) -> None:
-    low, high = device.limits(vector, member)
+    low, high = map(_number, device.vector(vector).limits.get(member, (None, None)))
     if low is not None and high is not None and low < high and not low <= value <= high:
         raise CaptureError(f"its {name} is {low:g} to {high:g}, not {value:g}.")
 
@@ -447,35 +411,36 @@ class Indi(DeviceSource[IndiDevice]):
         set_up(device, exposure_s, settings.gain, self._values["indi.binning"])
         commanded_s = self._now()
         blob = expose(device, exposure_s, self._values["indi.readout"])
-        return self._frame(blob, exposure_s, commanded_s, self._now())
-
-    def _frame(self, blob: Blob, wanted_s: float, commanded_s: float, ready_s: float) -> CapturedFrame:
+        ready_s = self._now()
         frame, header = decode_fits(_unpacked(blob), "its frame")
         if frame.untimed:
             raise CaptureError(f"the header of its frame cannot be used: {frame.untimed}.")
-        exposure_s = frame.exposure_s or wanted_s
-        check_exposed(exposure_s, wanted_s, commanded_s, ready_s)
-        told = str(header.get("DATE-OBS", ""))
-        clock_s = clock_stddev_of("indi", self._host, self._values)
-        stamp = stamp_of(told, clock_s, exposure_s, commanded_s, ready_s, self._values)
-        return stamp.captured(replace(frame, exposure_s=exposure_s), self.hardware_id)
+        told, clock_s = str(header.get("DATE-OBS", "")), clock_stddev_of("indi", self._host, self._values)
+        exposures_s, between_s = (frame.exposure_s or exposure_s, exposure_s), (commanded_s, ready_s)
+        return dated_by_driver(frame, told, clock_s, exposures_s, between_s, self._values)
 
 
-def _unpacked(blob: Blob) -> bytes:
-    """Unpack the FITS file of a BLOB; CaptureError if it is of another format or incomplete."""
-    if not 0 < blob.size <= BLOB_MAX:
-        raise CaptureError(f"its frame claims {blob.size} bytes; a frame has at most {BLOB_MAX}.")
-    data = blob.data
-    # astropy unpacks this format; the stated size is the unpacked image's.
-    if blob.format == ".fits.fz":
+def _unpacked(blob: ET.Element) -> bytes:
+    """Unpack the FITS file of a BLOB, and empty it; CaptureError if it is of another format or incomplete."""
+    kind = blob.get("format", "")
+    try:
+        # The stated size is that before compression.
+        data, size = base64.b64decode(blob.text or ""), int(blob.get("size", ""))
+    except (binascii.Error, ValueError) as error:
+        raise CaptureError(f"its frame is no BLOB ({one_line(error)}).") from None
+    blob.clear()
+    if not 0 < size <= BLOB_MAX:
+        raise CaptureError(f"its frame claims {size} bytes; a frame has at most {BLOB_MAX}.")
+    # astropy unpacks this format.
+    if kind == ".fits.fz":
         return data
-    if blob.format == ".fits.z":
+    if kind == ".fits.z":
         try:
-            data = zlib.decompressobj().decompress(data, blob.size + 1)
+            data = zlib.decompressobj().decompress(data, size + 1)
         except zlib.error as error:
             raise CaptureError(f"its frame cannot be unpacked ({one_line(error)}).") from error
-    elif blob.format != ".fits":
-        raise CaptureError(f"it sends {one_line(blob.format)!r}, not FITS: set its driver's transfer format.")
-    if len(data) != blob.size:
-        raise CaptureError(f"its frame has {len(data)} of {blob.size} bytes; it is left out.")
+    elif kind != ".fits":
+        raise CaptureError(f"it sends {one_line(kind)!r}, not FITS: set its driver's transfer format.")
+    if len(data) != size:
+        raise CaptureError(f"its frame has {len(data)} of {size} bytes; it is left out.")
     return data

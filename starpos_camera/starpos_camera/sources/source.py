@@ -3,11 +3,14 @@
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Generic, TypeVar
 
+import numpy as np
+
 from starpos.errors import StarposError
+from starpos.frames.encodings import ENCODINGS, pixels_of
 from starpos.frames.frame import Frame
 from starpos.instrument.camera import Camera
 
@@ -105,7 +108,8 @@ D = TypeVar("D")
 class DeviceSource(FrameSource, Generic[D]):
     """A source whose device is kept open between frames, and opened again after a failure.
 
-    A subclass opens its device, exposes with it, and looks at `_closing` while it waits.
+    A subclass opens its device, exposes with it, and looks at `_closing` while it waits. Its frames, remarks and errors
+    need no name of the camera: it is added here.
     """
 
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
@@ -119,13 +123,15 @@ class DeviceSource(FrameSource, Generic[D]):
             try:
                 if self._device is None:
                     self._device = self._open()
-                return self._expose(self._device, settings)
+                taken = self._expose(self._device, settings)
             except Exception as error:
                 self._release()
                 why = self._explain(error)
                 if why is None:
                     raise
                 raise CaptureError(f"{self.hardware_id}: {why}") from error
+        remark = taken.remark and f"{self.hardware_id}: {taken.remark}"
+        return replace(taken, frame=replace(taken.frame, source=self.hardware_id), remark=remark)
 
     def close(self) -> None:
         self._closing.set()
@@ -150,6 +156,18 @@ class DeviceSource(FrameSource, Generic[D]):
     def _explain(self, error: Exception) -> str | None:
         """Say in a sentence what an error means; None for a defect, which the node reports as one."""
         return str(error) if isinstance(error, StarposError) else None
+
+
+def decoded(encoding: str, data: bytes, size: tuple[int, int], more: int = 0) -> tuple[np.ndarray, str]:
+    """Pixels of a driver's buffer, and the pattern of their mosaic; CaptureError for a buffer of another length.
+
+    encoding: one of ENCODINGS.  size: width and height, px.  more: number of bytes after the pixels, to be left out.
+    """
+    width, height = size
+    row = ENCODINGS[encoding].row_bytes(width)
+    if len(data) != row * height + more:
+        raise CaptureError(f"a frame has {len(data)} bytes instead of {row * height + more}.")
+    return pixels_of(encoding, data, width, height, row, False, "the frame")
 
 
 def missing(module: str, package: str) -> str | None:

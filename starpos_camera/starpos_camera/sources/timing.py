@@ -5,7 +5,7 @@ import math
 import re
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime, timezone
 from typing import Any
 
@@ -23,56 +23,43 @@ CLOCK_TOLERANCE_S = 0.05
 
 
 def clock_stddev_of(source: str, host: str, values: Mapping) -> float:
-    """Error of the clock of a server on that host, as `stamp_of` takes it."""
+    """Error of the clock of a server on that host, as `dated_by_driver` takes it."""
     return 0.0 if host in LOCAL else values[f"{source}.clock_stddev"]
 
 
-@dataclass(frozen=True)
-class Stamp:
-    """Middle of an exposure (Unix time), and how it is known.
+def dated(
+    frame: Frame, mid_s: float, stddev_s: float, source: int, clock_stddev_s: float = 0.0
+) -> CapturedFrame:
+    """A frame with the middle of its exposure (Unix time) and its error (s), by one of Capture's sources.
 
-    stddev_s        standard deviation of mid_s
-    source          one of starpos_interfaces/Capture's constants
-    clock_stddev_s  standard deviation against UTC of another machine's clock; 0: the clock is this machine's
-    remark          what is wrong with the driver's clock, without a full stop; '' for nothing
+    clock_stddev_s: standard deviation against UTC of another machine's clock; 0: the clock is this machine's.
     """
-
-    mid_s: float
-    stddev_s: float
-    source: int
-    clock_stddev_s: float = 0.0
-    remark: str = ""
-
-    def captured(self, frame: Frame, hardware_id: str, remark: str = "") -> CapturedFrame:
-        """A frame of a camera with this stamp; remark: without the camera's name, less urgent than the stamp's own."""
-        stamped = replace(
-            frame,
-            mid_unix_s=self.mid_s,
-            source=hardware_id,
-            stamp_stddev_s=self.stddev_s,
-            clock_stddev_s=self.clock_stddev_s,
-        )
-        said = f"{self.remark}." if self.remark else remark
-        return CapturedFrame(stamped, self.source, remark=said and f"{hardware_id}: {said}")
+    stamped = replace(frame, mid_unix_s=mid_s, stamp_stddev_s=stddev_s, clock_stddev_s=clock_stddev_s)
+    return CapturedFrame(stamped, source)
 
 
-def check_exposed(exposure_s: float, wanted_s: float, commanded_s: float, ready_s: float) -> None:
-    """Raise CaptureError if a camera reports an exposure that does not fit between command and frame."""
+def dated_by_driver(
+    frame: Frame,
+    told: str,
+    clock_stddev_s: float,
+    exposures_s: tuple[float, float],
+    between_s: tuple[float, float],
+    values: Mapping,
+) -> CapturedFrame:
+    """Date a frame by the better time: the start that the driver reports (`told`, ISO 8601), or the command.
+
+    clock_stddev_s: of the driver's clock; 0: it is this machine's clock; NaN: unknown, and the start is not used.
+    exposures_s: the exposure that the driver reports, and the one that was asked for.
+    between_s: Unix times of command and arrival. CaptureError for an exposure that does not fit between them; a start
+    that does not is not used.
+    """
+    (exposure_s, wanted_s), (commanded_s, ready_s) = exposures_s, between_s
     if not 0 < exposure_s <= ready_s - commanded_s + CLOCK_TOLERANCE_S:
         raise CaptureError(
             f"it says that it has exposed for {exposure_s:g} s, when {wanted_s:g} s were asked."
         )
-
-
-def stamp_of(
-    told: str, clock_stddev_s: float, exposure_s: float, commanded_s: float, ready_s: float, values: Mapping
-) -> Stamp:
-    """Choose the better stamp: from the start that the driver reports (`told`, ISO 8601), or from the command.
-
-    clock_stddev_s: of the driver's clock; 0: it is this machine's clock; NaN: unknown, and the start is not used.
-    commanded_s, ready_s: Unix times between which the exposure lies; a start that contradicts them is not used.
-    """
-    commanded = Stamp(*middle_of_commanded(commanded_s, exposure_s, values), Capture.COMMAND)
+    frame = replace(frame, exposure_s=exposure_s)
+    commanded = dated(frame, *middle_of_commanded(commanded_s, exposure_s, values), Capture.COMMAND)
     start = read_utc(told)
     if start is None or math.isnan(clock_stddev_s):
         return commanded
@@ -83,11 +70,11 @@ def stamp_of(
     tolerance_s = CLOCK_TOLERANCE_S + resolution_s + 3 * clock_stddev_s
     if max(commanded_s - start_s, start_s + exposure_s - ready_s) > tolerance_s:
         off = f"its times of exposures are off by more than {tolerance_s:.2g} s and not used"
-        return replace(commanded, remark=f"{off}; set its machine's clock, to UTC")
+        return replace(commanded, remark=f"{off}; set its machine's clock, to UTC.")
     mid_s, stddev_s = middle_of_started(start_s, resolution_s, exposure_s, values)
-    if math.hypot(stddev_s, clock_stddev_s) > commanded.stddev_s:
+    if math.hypot(stddev_s, clock_stddev_s) > commanded.frame.stamp_stddev_s:
         return commanded
-    return Stamp(mid_s, stddev_s, Capture.DRIVER, clock_stddev_s)
+    return dated(frame, mid_s, stddev_s, Capture.DRIVER, clock_stddev_s)
 
 
 def middle_of_commanded(commanded_s: float, exposure_s: float, values: Mapping) -> tuple[float, float]:

@@ -11,6 +11,7 @@ short, but the kernel's uvcvideo drops such frames (its parameter nodrop is 0).
 import math
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -20,7 +21,8 @@ import numpy as np
 from starpos.frames.exposure import MAX_READOUT_S, Shutter
 from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos.frames.pictures import quiet_opencv
-from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, decoded
+from starpos_camera.sources.timing import dated
 from starpos_interfaces.msg import Capture
 
 if TYPE_CHECKING:
@@ -40,25 +42,27 @@ MAX_WAIT_S = 10.0
 # Frames per second if the driver reports none; a low value is the cautious one.
 DEFAULT_RATE = 5.0
 MAX_AGE_S = 600.0
-MONO = {"GREY": "u1", "Y16 ": "<u2", "Y12 ": "<u2", "Y10 ": "<u2"}
-# Index of Y in its pair of bytes.
-LUMA = {"YUYV": 0, "YVYU": 0, "UYVY": 1, "VYUY": 1}
-# In these formats all Y come first.
+# In these formats all Y come first, and half as many bytes of colour follow.
 PLANAR = ("NV12", "NV21", "YU12", "YV12")
-# Formats of 8, 10, 12 and 16 bits.
-MOSAIC = {
-    letters: (pattern, "<u2" if deep else "u1")
-    for pattern, family in {
-        "rggb": ("RGGB", "RG10", "RG12", "RG16"),
-        "bggr": ("BA81", "BG10", "BG12", "BYR2"),
-        "grbg": ("GRBG", "BA10", "BA12", "GR16"),
-        "gbrg": ("GBRG", "GB10", "GB12", "GB16"),
-    }.items()
-    for deep, letters in enumerate(family)
-}
-COLOUR = ("BGR3", "RGB3")
 JPEG = ("MJPG", "JPEG")
-FORMATS = (*MONO, *LUMA, *PLANAR, *MOSAIC, *COLOUR, *JPEG)
+# The formats that are read, by V4L2's four letters, and their encodings.
+FORMATS = (
+    {"GREY": "mono8", "Y16 ": "mono16", "Y12 ": "mono16", "Y10 ": "mono16", "BGR3": "bgr8", "RGB3": "rgb8"}
+    | {"YUYV": "yuyv", "YVYU": "yuyv", "UYVY": "uyvy", "VYUY": "uyvy"}
+    | dict.fromkeys(PLANAR, "mono8")
+    | {
+        letters: f"bayer_{pattern}{16 if deep else 8}"
+        # of 8, 10, 12 and 16 bits
+        for pattern, family in {
+            "rggb": ("RGGB", "RG10", "RG12", "RG16"),
+            "bggr": ("BA81", "BG10", "BG12", "BYR2"),
+            "grbg": ("GRBG", "BA10", "BA12", "GR16"),
+            "gbrg": ("GBRG", "GB10", "GB12", "GB16"),
+        }.items()
+        for deep, letters in enumerate(family)
+    }
+    | dict.fromkeys(JPEG, "")
+)
 
 
 class Video(DeviceSource["VideoCapture"]):
@@ -106,17 +110,10 @@ class Video(DeviceSource["VideoCapture"]):
             if not came:
                 raise CaptureError("it gave no frame.")
             pixels, pattern = self._pixels(cv2, raw)
-        frame = Frame(
-            pixels,
-            pattern=pattern,
-            mid_unix_s=mid_s,
-            exposure_s=exposure_s,
-            source=self.hardware_id,
-            stamp_stddev_s=stddev_s,
-            # from either end, and no longer than from one frame to the next
-            shutter=Shutter(0.0, min(period_s, MAX_READOUT_S) / math.sqrt(3)),
-        )
-        return CapturedFrame(frame, stamp, remark=remark and f"{self.hardware_id}: {remark}")
+        # from either end, and no longer than from one frame to the next
+        shutter = Shutter(0.0, min(period_s, MAX_READOUT_S) / math.sqrt(3))
+        frame = Frame(pixels, pattern=pattern, exposure_s=exposure_s, shutter=shutter)
+        return replace(dated(frame, mid_s, stddev_s, stamp), remark=remark)
 
     def _explain(self, error: Exception) -> str:
         text = str(error) if isinstance(error, CaptureError) else f"{type(error).__name__}: {error}."
@@ -245,24 +242,12 @@ class Video(DeviceSource["VideoCapture"]):
     def _pixels(self, cv2: ModuleType, raw: np.ndarray) -> tuple[np.ndarray, str]:
         """Convert a buffer to pixels and the pattern of their mosaic; CaptureError if it is incomplete."""
         width, height = self._size
-        raw = np.ascontiguousarray(raw).view(np.uint8).ravel()
-        if self._format in JPEG:
-            return _from_jpeg(cv2, raw, width, height), ""
-        pattern, kind = MOSAIC.get(self._format, ("", MONO.get(self._format, "u1")))
-        each = {"NV12": 1.5, "NV21": 1.5, "YU12": 1.5, "YV12": 1.5, "BGR3": 3, "RGB3": 3}.get(self._format)
-        each = each or (2 if self._format in LUMA else np.dtype(kind).itemsize)
-        if len(raw) != int(width * height * each):
-            raise CaptureError(f"a frame has {len(raw)} bytes instead of {int(width * height * each)}.")
-        if self._format in LUMA:
-            pixels = raw.reshape(height, width, 2)[..., LUMA[self._format]]
-        elif self._format in PLANAR:
-            pixels = raw[: width * height].reshape(height, width)
-        elif self._format in COLOUR:
-            pixels = raw.reshape(height, width, 3)[..., :: 1 if self._format == "BGR3" else -1]
-        else:
-            pixels = raw.view(kind).astype(kind.lstrip("<"), copy=False).reshape(height, width)
         # A copy, because OpenCV's memory may be the driver's.
-        return np.array(pixels, order="C"), pattern
+        data = raw.tobytes()
+        if self._format in JPEG:
+            return _from_jpeg(cv2, data, width, height), ""
+        colours = width * height // 2 if self._format in PLANAR else 0
+        return decoded(FORMATS[self._format], data, self._size, colours)
 
 
 def _period_s(cv2: ModuleType, capture: "VideoCapture") -> float:
@@ -270,9 +255,9 @@ def _period_s(cv2: ModuleType, capture: "VideoCapture") -> float:
     return 1 / rate if 0.01 < rate < 10000 else 1 / DEFAULT_RATE
 
 
-def _from_jpeg(cv2: ModuleType, raw: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Decode the brightness of a JPEG, (height, width) uint8."""
-    data = raw.tobytes().rstrip(b"\0")
+def _from_jpeg(cv2: ModuleType, data: bytes, width: int, height: int) -> np.ndarray:
+    """Decode the brightness of a JPEG, (height, width) uint8; zeros may follow it."""
+    data = data.rstrip(b"\0")
     pixels = (
         cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
         if data.endswith(b"\xff\xd9")

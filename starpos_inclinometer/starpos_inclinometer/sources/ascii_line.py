@@ -15,9 +15,9 @@ from starpos.instrument.tilt_log import noise_text
 from starpos.messages.tilt import GAP, TIME_UNKNOWN, Reading
 from starpos.units import ARCSEC
 from starpos_inclinometer.clock import ArrivalFilter, Moment, PaceWatch
-from starpos_inclinometer.sources.mcu_protocol import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
+from starpos_inclinometer.sources.mcu_protocol import Gate, clocks_agree
 from starpos_inclinometer.sources.serial_link import SerialLink, port_refusal
-from starpos_inclinometer.sources.source import Arrival, Counts, LinkSource, Surroundings
+from starpos_inclinometer.sources.source import Arrival, Counts, Surroundings
 from starpos_inclinometer.sources.tilts import SensorTilts, noise_floor_rad
 
 # In bytes.
@@ -84,24 +84,17 @@ def pattern_error(pattern: str) -> str | None:
 class LineDecoder:
     """Turns a device's text into the samples that are believed.
 
-    pattern: must match a whole line without the blanks around it; see `pattern_error`.
-    unit: one of UNITS.
-    resolution: step of the values in the unit; NaN takes the last digit of each line.
-    period_s: time from line to line.
-    request: text to send once a period, for a device that speaks when asked; empty: nothing.
+    values: the node's parameters. `ascii.pattern` must match a whole line without the blanks around it.
     """
 
     answered = False
     hint = "check `baud` and `ascii.pattern`, and that this is the inclinometer."
 
-    def __init__(
-        self, pattern: str, unit: str, resolution: float = math.nan, period_s: float = 1.0, request: str = ""
-    ) -> None:
-        self.period_s = self.command_period_s = period_s
-        self._pattern = re.compile(pattern)
-        self._unit = unit
-        self._resolution = resolution
-        self._request = request.encode()
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self.period_s = self.command_period_s = values["ascii.period"]
+        self._pattern = re.compile(values["ascii.pattern"])
+        self._unit, self._resolution = values["ascii.unit"], values["ascii.resolution"]
+        self._request = values["ascii.request"].encode()
         self._lines = TextLines()
         self._gate = Gate(_follows, NEAR_RAD)
         self._last: Line | None = None
@@ -242,25 +235,13 @@ def _follows(a: Arrival, b: Arrival) -> bool:
     if None in (first.milliseconds, second.milliseconds):
         return True
     elapsed = (second.milliseconds - first.milliseconds) & 0xFFFFFFFF
-    apart_s = b.moment.monotonic_s - a.moment.monotonic_s
-    return elapsed > 0 and abs(elapsed * 1e-3 - apart_s) <= HOST_TOLERANCE_S + HOST_TOLERANCE_SHARE * apart_s
+    return elapsed > 0 and clocks_agree(elapsed, a, b)
 
 
-class AsciiSource(LinkSource):
-    """Reads the lines of a digital tiltmeter."""
-
+class AsciiSource(SerialLink[LineDecoder]):
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
-        self.name = values["port"]
-        self._baud = values["baud"]
-        self._decoder = LineDecoder(
-            values["ascii.pattern"],
-            values["ascii.unit"],
-            values["ascii.resolution"],
-            values["ascii.period"],
-            values["ascii.request"],
-        )
-        self._link = SerialLink(values["port"], self._baud, self._decoder, host.clock, host.wake)
-        self._arrivals, self._pace = ArrivalFilter(), PaceWatch()
+        super().__init__(host, values, LineDecoder(values))
+        self._filter, self._pace = ArrivalFilter(), PaceWatch()
         self._tilts, self._sequence = SensorTilts(), -1
         self.configure(values)
 
@@ -279,17 +260,17 @@ class AsciiSource(LinkSource):
         self._latency_s = 0.0 if math.isnan(values["latency"]) else values["latency"]
 
     def fetch(self) -> list[Reading]:
-        return [self._read(arrival) for arrival in self._link.fetch()]
+        return [self._reading(arrival) for arrival in self.arrivals()]
 
-    def _read(self, arrival: Arrival) -> Reading:
+    def _reading(self, arrival: Arrival) -> Reading:
         line, moment = arrival.sample, arrival.moment
         late_s: float | None
         if line.milliseconds is None:
             late_s = 0.0 if self._pace.on_time(moment.monotonic_s) else None
         else:
             if line.broken:
-                self._arrivals.restart()
-            late_s = self._arrivals.delay(line.milliseconds, moment.monotonic_s)
+                self._filter.restart()
+            late_s = self._filter.delay(line.milliseconds, moment.monotonic_s)
         angles = (line.x, line.y) if line.z is None else (line.x, line.y, line.z)
         self._sequence = (self._sequence + 1 + line.lost) & 0xFFFFFFFF
         return self._tilts.reading(
@@ -302,8 +283,8 @@ class AsciiSource(LinkSource):
             flags=(GAP if line.lost or line.broken else 0) | (TIME_UNKNOWN if late_s is None else 0),
         )
 
-    def _values(self) -> Mapping[str, object]:
+    def _shown(self) -> Mapping[str, object]:
         return {
-            "clock rate error (ppm)": self._arrivals.rate_ppm,
+            "clock rate error (ppm)": self._filter.rate_ppm,
             "noise by axis (arcsec)": noise_text(self._tilts.noise.sigma),
         }

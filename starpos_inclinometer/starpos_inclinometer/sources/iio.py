@@ -20,7 +20,7 @@ from starpos_inclinometer.sources.iio_device import (
     find,
     set_sampling_frequency,
 )
-from starpos_inclinometer.sources.source import Arrival, Counts, Health, Link, LinkSource, Phase, Surroundings
+from starpos_inclinometer.sources.source import Arrival, Counts, Health, Link, Phase, Surroundings
 from starpos_inclinometer.sources.tilts import SensorTilts, noise_floor_rad
 
 PATIENCE_S = 1.0
@@ -28,15 +28,19 @@ PATIENCE_S = 1.0
 SLOW_S = 0.1
 
 
-class IioLink(Link):
-    """Reads raw values; `identity` of an arrival is the device."""
+class IioSource(Link):
+    """An inclinometer or accelerometer of Linux's Industrial I/O; `identity` of an arrival is the device."""
 
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
-        super().__init__(host.clock, host.wake, "iio")
         self._root, self._wanted = Path(values["iio.root"]), values["iio.device"].strip()
+        super().__init__(host, self._wanted or values["iio.root"])
         self._sampling_hz = values["iio.sampling_frequency"]
-        self.rate_hz = values["rate"]
         self._good = self._failed = 0
+        self.angles, self.forces = SensorTilts(), ImuTilts(values)
+        self.unusable = 0
+        self.device: IioDevice | None = None
+        self._sequence = -1
+        self.configure(values)
 
     def _counts(self) -> Counts:
         return Counts(good=self._good, malformed=self._failed)
@@ -60,7 +64,7 @@ class IioLink(Link):
         good_s = due_s = self._clock.monotonic_s()
         while not self._stop.is_set():
             # A device that samples more slowly would be read twice.
-            rate_hz = min(self.rate_hz, device.sampling_hz) if device.sampling_hz > 0 else self.rate_hz
+            rate_hz = min(self._rate_hz, device.sampling_hz) if device.sampling_hz > 0 else self._rate_hz
             now_s = self._clock.monotonic_s()
             due_s = max(due_s + 1 / rate_hz, now_s)
             if self._stop.wait(due_s - now_s):
@@ -95,21 +99,6 @@ class IioLink(Link):
         if now.monotonic_s - good_s > PATIENCE_S:
             self._enter(Phase.GARBLED, f"{sentence}; it is retried.")
 
-
-class IioSource(LinkSource):
-    """An inclinometer or accelerometer of Linux's Industrial I/O."""
-
-    _link: IioLink
-
-    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
-        self.name = values["iio.device"].strip() or values["iio.root"]
-        self._link = IioLink(host, values)
-        self.angles, self.forces = SensorTilts(), ImuTilts(values)
-        self.unusable = 0
-        self.device: IioDevice | None = None
-        self._sequence = -1
-        self.configure(values)
-
     @staticmethod
     def refusal(values: Mapping[str, Any]) -> str | None:
         if values["iio.root"].strip():
@@ -118,14 +107,14 @@ class IioSource(LinkSource):
 
     def configure(self, values: Mapping[str, Any]) -> None:
         self._parameters = values
-        self._link.rate_hz = values["rate"]
+        self._rate_hz = values["rate"]
         self.angles.stuck = values["iio.stuck_samples"]
         self.angles.noise_floor_rad = noise_floor_rad(values)
         self._latency_s = 0.0 if math.isnan(values["latency"]) else values["latency"]
         self.forces.configure(values)
 
     def fetch(self) -> list[Reading]:
-        read = (self.read(arrival) for arrival in self._link.fetch())
+        read = (self.read(arrival) for arrival in self.arrivals())
         return [reading for reading in read if reading is not None]
 
     def read(self, arrival: Arrival) -> Reading | None:
@@ -174,7 +163,7 @@ class IioSource(LinkSource):
         sentence = f"the accelerometer is not at rest: {unrest}; tilts come when it is."
         return replace(health, phase=Phase.MOVING, sentence=sentence)
 
-    def _values(self) -> Mapping[str, object]:
+    def _shown(self) -> Mapping[str, object]:
         device = self.device
         return {
             "driver": device.model if device else "unknown",

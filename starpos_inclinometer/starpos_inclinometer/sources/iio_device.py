@@ -20,7 +20,7 @@ AXES = ("x", "y", "z")
 # The kernel's sca3300 states accelerations in g, where the ABI has m/s2, and gives its temperature no scale
 # (as of Linux 6.12); T = -273 + TEMP / 18.9 deg C is the data sheet's (Doc. 3165 Rev. 3, 2.4).
 IN_G = {"sca3300", "scl3300"}
-SHEET_TEMPERATURES = dict.fromkeys(IN_G, (-273 * 18.9, 1000 / 18.9))
+SHEET_TEMPERATURES = dict.fromkeys(IN_G, (1000 / 18.9, -273 * 18.9))
 # A read that the driver refuses although the device is there, such as one whose checksum was wrong.
 FAILED_READS = {errno.EIO, errno.EINVAL, errno.EAGAIN, errno.ETIMEDOUT, errno.EREMOTEIO, errno.EPROTO}
 
@@ -77,7 +77,6 @@ class IioDevice:
 
     @property
     def step_rad(self) -> float:
-        """Step of a tilt near the horizon."""
         step = max(abs(c.scale) for c in self.channels)
         return math.radians(step) if self.kind == INCLINATION else step * self._unit / STANDARD_GRAVITY
 
@@ -140,7 +139,8 @@ def set_sampling_frequency(device: IioDevice, hertz: float) -> IioDevice:
 def _describe(folder: Path) -> IioDevice:
     model = (folder / "name").read_text().strip().lower()
     for kind, least in ((INCLINATION, 2), (ACCELERATION, 3)):
-        channels = [c for axis in AXES if (c := _channel(folder, kind, axis)) is not None]
+        shared = (f"in_{kind}_", "in_", "")
+        channels = [c for axis in AXES if (c := _channel(folder, f"in_{kind}_{axis}", *shared)) is not None]
         in_order = [c.name[-1] for c in channels] == list(AXES[: len(channels)])
         if len(channels) >= least and in_order:
             break
@@ -157,26 +157,20 @@ def _describe(folder: Path) -> IioDevice:
     )
 
 
-def _channel(folder: Path, kind: str, axis: str) -> Channel | None:
-    """Find a channel whose values have a unit: its own, its kind's, or of all channels; without a scale it is unknown."""
-    name = f"in_{kind}_{axis}"
+def _channel(folder: Path, name: str, *shared: str) -> Channel | None:
+    """Find a channel whose values have a unit: its own, or one that channels share; without a scale it is unknown."""
     if not (folder / f"{name}_raw").exists():
         return None
-    shared = (f"in_{kind}_", "in_", "")
     scale, offset = (_first(folder, name, what, *shared) for what in ("scale", "offset"))
     return None if not scale else Channel(name, scale, offset or 0.0)
 
 
 def _temperature(folder: Path, model: str) -> Channel | None:
     for name in ("in_temp", "in_temp0"):
-        if not (folder / f"{name}_raw").exists():
-            continue
-        scale, offset = (_first(folder, name, what, "in_temp_") for what in ("scale", "offset"))
-        if scale:
-            return Channel(name, scale, offset or 0.0)
-        if model in SHEET_TEMPERATURES:
-            offset, scale = SHEET_TEMPERATURES[model]
-            return Channel(name, scale, offset)
+        if channel := _channel(folder, name, "in_temp_"):
+            return channel
+        if model in SHEET_TEMPERATURES and (folder / f"{name}_raw").exists():
+            return Channel(name, *SHEET_TEMPERATURES[model])
     return None
 
 

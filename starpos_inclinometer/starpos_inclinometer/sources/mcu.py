@@ -30,13 +30,11 @@ from starpos_inclinometer.sources.mcu_protocol import (
     mcu_follows,
 )
 from starpos_inclinometer.sources.serial_link import SerialLink, port_refusal
-from starpos_inclinometer.sources.source import Arrival, Counts, LinkSource, Surroundings
+from starpos_inclinometer.sources.source import Arrival, Counts, Surroundings
 from starpos_inclinometer.sources.tilts import (
     BoardSensor,
     Sca100t,
-    Sca100tCalibration,
     Scl3300,
-    noise_floor_rad,
 )
 from starpos_interfaces import msg
 
@@ -149,19 +147,6 @@ NEAR_CODES = {SensorKind.SCA100T: 11_000, SensorKind.SCL3300: 2_330}
 SMALLEST_DETERMINANT = 0.5
 
 
-def calibration(values: Mapping[str, Any]) -> Sca100tCalibration:
-    """Make the calibration of the sensor from the parameters."""
-    return Sca100tCalibration(
-        offset_volts=values["offset_volts"],
-        sensitivity_volts_per_g=values["sensitivity"],
-        divider=values["divider"],
-        reference_volts=values["reference_volts"],
-        temperature_reference_c=values["temperature.reference"],
-        offset_per_c=(values["temperature.offset_x"], values["temperature.offset_y"]),
-        sensitivity_per_c=(values["temperature.sensitivity_x"], values["temperature.sensitivity_y"]),
-    )
-
-
 class McuDecoder:
     """Turns the MCU's bytes into the samples that are believed, and asks the MCU for the wanted rate."""
 
@@ -238,12 +223,12 @@ class McuDecoder:
         return b""
 
     def _admit(self, arrival: Arrival) -> list[Arrival]:
-        rejected = self._gate.rejected
+        doubts = self._gate.rejected + self._continuity.restarts
         believed = [
             Arrival(self._continuity.follow(a.sample), a.moment, a.identity)
             for a in self._gate.admit(arrival)
         ]
-        if self._gate.rejected != rejected or any(a.sample.restarted for a in believed):
+        if self._gate.rejected + self._continuity.restarts != doubts:
             # After a reset the MCU runs at its default rate, perhaps with another firmware; samples that do not fit may
             # come from an unseen reset.
             self._ask = True
@@ -253,32 +238,44 @@ class McuDecoder:
         return mcu_follows(a, b, 1000 / self.identity.rate_hz if self.identity else None)
 
 
-class McuTilts:
-    """Converts believed samples to readings."""
+class McuSource(SerialLink[McuDecoder]):
+    """The starpos microcontroller on a serial port."""
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self._sca100t = Sca100t()
+    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
+        super().__init__(host, values, McuDecoder(values["rate"]))
         self._sensors: dict[int, BoardSensor] = {
-            SensorKind.SCA100T: self._sca100t,
-            SensorKind.SCL3300: Scl3300(),
+            SensorKind.SCA100T: Sca100t(values),
+            SensorKind.SCL3300: Scl3300(values),
         }
         # The sensor of the unit that was last heard.
-        self.sensor: BoardSensor = self._sca100t
-        self.arrivals = ArrivalFilter()
+        self.sensor = self._sensors[SensorKind.SCA100T]
+        self.filter, self.pulses = ArrivalFilter(), PulseTimes()
         self._line_s = mcu_protocol.SAMPLE_LINE * BITS_PER_BYTE / values["baud"]
-        self._delay_ms = 0
+        self._rate_hz = self._delay_ms = 0
         # The samples that came before the identity were the first after a gap.
         self._gap = False
-        self.pulses = PulseTimes()
-        self._rate_hz = 0
         self.configure(values)
 
+    @staticmethod
+    def refusal(values: Mapping[str, Any]) -> str | None:
+        xx, xy, yx, yy = values["cross_axis"]
+        if abs(xx * yy - xy * yx) < SMALLEST_DETERMINANT:
+            return (
+                "parameter cross_axis must be two different axes (xx, xy, yx, yy), such as [1, 0, 0, 1]; "
+                f"{list(values['cross_axis'])} was given."
+            )
+        return port_refusal(values)
+
     def configure(self, values: Mapping[str, Any]) -> None:
-        self._sca100t.calibration = calibration(values)
         for sensor in self._sensors.values():
-            sensor.cross_axis = tuple(values["cross_axis"])
-            sensor.noise_floor_rad = noise_floor_rad(values)
-        self._latency_s = values["latency"]
+            sensor.configure(values)
+        self._latency_s, self._decoder.wanted_rate_hz = values["latency"], values["rate"]
+
+    def fetch(self) -> list[Reading]:
+        return self.read(self.arrivals())
+
+    def fetch_pulses(self) -> list[msg.Pulse]:
+        return self.pulses.fetch()
 
     def read(self, arrivals: list[Arrival]) -> list[Reading]:
         """Convert the arrivals that an `McuDecoder` believed, in order.
@@ -291,15 +288,14 @@ class McuTilts:
             if isinstance(arrival.sample, Pulse):
                 self._date_pulse(arrival)
             elif arrival.identity is None:
-                sample = arrival.sample
-                self._gap |= bool(sample.lost) or sample.restarted or sample.resumed
+                self._gap |= arrival.sample.lost > 0 or arrival.sample.broken
             else:
                 readings.append(self._reading(arrival))
         return readings
 
     def _date_pulse(self, arrival: Arrival) -> None:
         """Date an edge through the clocks' relation that the samples have shown."""
-        sent_s = self.arrivals.arrival_s(arrival.sample.milliseconds, arrival.moment.monotonic_s)
+        sent_s = self.filter.arrival_s(arrival.sample.milliseconds, arrival.moment.monotonic_s)
         if sent_s is not None:
             sent_s -= self._sample_to_arrival_s()
         self.pulses.date(arrival.sample, arrival.moment, sent_s)
@@ -318,64 +314,34 @@ class McuTilts:
         # From now on all lines come later, or earlier, by the difference.
         if identity.delay_ms != self._delay_ms:
             self._delay_ms = identity.delay_ms
-            self.arrivals.restart()
+            self.filter.restart()
 
     def _reading(self, arrival: Arrival) -> Reading:
         sample, moment = arrival.sample, arrival.moment
         self._follow(arrival.identity)
-        sample, self._gap = replace(sample, resumed=sample.resumed or self._gap), False
-        if sample.restarted or sample.resumed:
-            self.arrivals.restart()
+        sample, self._gap = replace(sample, broken=sample.broken or self._gap), False
+        if sample.broken:
+            self.filter.restart()
             self.pulses.restart()
-        known_s = self.arrivals.delay(sample.milliseconds, moment.monotonic_s)
+        known_s = self.filter.delay(sample.milliseconds, moment.monotonic_s)
         late_s = known_s or 0.0
         stamp_ns = moment.stamp_ns(late_s + self._sample_to_arrival_s())
         reading = self.sensor.measure(sample, moment.monotonic_s - late_s, stamp_ns)
         return reading if known_s is not None else replace(reading, flags=reading.flags | TIME_UNKNOWN)
-
-
-class McuSource(LinkSource):
-    """The starpos microcontroller on a serial port; see `McuTilts`."""
-
-    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
-        self.name = values["port"]
-        self._decoder = McuDecoder(values["rate"])
-        self._link = SerialLink(values["port"], values["baud"], self._decoder, host.clock, host.wake)
-        self._tilts = McuTilts(values)
-
-    @staticmethod
-    def refusal(values: Mapping[str, Any]) -> str | None:
-        xx, xy, yx, yy = values["cross_axis"]
-        if abs(xx * yy - xy * yx) < SMALLEST_DETERMINANT:
-            return (
-                "parameter cross_axis must be two different axes (xx, xy, yx, yy), such as [1, 0, 0, 1]; "
-                f"{list(values['cross_axis'])} was given."
-            )
-        return port_refusal(values)
-
-    def configure(self, values: Mapping[str, Any]) -> None:
-        self._tilts.configure(values)
-        self._decoder.wanted_rate_hz = values["rate"]
-
-    def fetch(self) -> list[Reading]:
-        return self._tilts.read(self._link.fetch())
-
-    def fetch_pulses(self) -> list[msg.Pulse]:
-        return self._tilts.pulses.fetch()
 
     def _complaint(self) -> str:
         if not self._decoder.refused:
             return ""
         return f"the microcontroller refused {self._decoder.wanted_rate_hz} Hz: set another `rate`."
 
-    def _values(self) -> Mapping[str, object]:
-        identity, tilts = self._decoder.identity, self._tilts
+    def _shown(self) -> Mapping[str, object]:
+        identity = self._decoder.identity
         return {
-            "clock rate error (ppm)": tilts.arrivals.rate_ppm,
-            "noise x, y (arcsec)": noise_text(tilts.sensor.noise.sigma),
-            "sensor temperature (deg C)": tilts.sensor.temperature.celsius(math.nan),
-            "pulses, and without a time": f"{tilts.pulses.dated}, {tilts.pulses.undated}",
-            "receiver's second": tilts.pulses.second,
+            "clock rate error (ppm)": self.filter.rate_ppm,
+            "noise x, y (arcsec)": noise_text(self.sensor.noise.sigma),
+            "sensor temperature (deg C)": self.sensor.temperature.celsius(math.nan),
+            "pulses, and without a time": f"{self.pulses.dated}, {self.pulses.undated}",
+            "receiver's second": self.pulses.second,
             "firmware": f"{identity.firmware >> 8}.{identity.firmware & 255}" if identity else "unknown",
             "sensor": SensorKind(identity.kind).name if identity else "unknown",
             "unit": f"{identity.unit:08X}" if identity else "unknown",

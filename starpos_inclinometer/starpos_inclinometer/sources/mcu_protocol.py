@@ -26,15 +26,6 @@ RISING = 0x80
 MAX_SENDING_MS = 50
 
 _LINE = re.compile(rb"\$([^$*\r\n]{1,40})\*([0-9A-F]{4})\r\n")
-_SAMPLE = re.compile(
-    rb"T,([0-9A-F]{4}),([0-9A-F]{8}),([0-9A-F]{6}),([0-9A-F]{6}),([0-9A-F]{2}),([0-9A-F]{2})"
-)
-# Version 1 had no kind: its firmware was for the SCA100T alone.
-_IDENTITY = re.compile(
-    rb"I,([0-9A-F]{2}),([0-9A-F]{4}),([0-9A-F]{8}),([0-9A-F]{2}),([0-9A-F]{4})(?:,([0-9A-F]{2}))?"
-)
-_PULSE = re.compile(rb"P,([0-9A-F]{2}),([0-9A-F]{2}),([0-9A-F]{2}),([0-9A-F]{8}),([0-9A-F]{4})")
-_REFUSAL = re.compile(rb"N,([0-9A-F]{2})")
 
 
 class SampleStatus(IntFlag):
@@ -98,10 +89,8 @@ class Sample:
     status: int
     # Samples lost just before this one.
     lost: int = 0
-    # The MCU was reset since the sample before.
-    restarted: bool = False
-    # The first sample after the connection was opened again.
-    resumed: bool = False
+    # It does not continue the one before: the MCU was reset, or the connection was opened again.
+    broken: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,42 +189,45 @@ class LineParser:
         self._rest = b""
 
 
+def _form(letter: str, **digits: int) -> re.Pattern[bytes]:
+    """The form of a body: a letter, and the named fields of so many hexadecimal digits."""
+    fields = "".join(rf",(?P<{name}>[0-9A-F]{{{count}}})" for name, count in digits.items())
+    return re.compile((letter + fields).encode())
+
+
+def _pulse(edge: int, **fields: int) -> Pulse:
+    return Pulse(input=edge & ~RISING, rising=bool(edge & RISING), **fields)
+
+
+_IDENTITY = {"version": 2, "firmware": 4, "unit": 8, "rate_hz": 2, "delay_ms": 4}
+_FORMS: tuple[tuple[re.Pattern[bytes], Callable[..., Message]], ...] = (
+    (_form("T", sequence=4, milliseconds=8, x=6, y=6, temperature=2, status=2), Sample),
+    (_form("P", edge=2, number=2, bounces=2, milliseconds=8, microseconds=4), _pulse),
+    (_form("I", **_IDENTITY, kind=2), Identity),
+    # Version 1 had no kind: its firmware was for the SCA100T alone.
+    (_form("I", **_IDENTITY), Identity),
+    (_form("N", reason=2), Refusal),
+)
+
+
 def _parse(body: bytes) -> Message | None:
-    if match := _SAMPLE.fullmatch(body):
-        sequence, milliseconds, x, y, temperature, status = (int(group, 16) for group in match.groups())
-        sample = Sample(
-            sequence=sequence, milliseconds=milliseconds, x=x, y=y, temperature=temperature, status=status
-        )
-        return None if sample.status & SampleStatus.FIRST and sample.sequence else sample
-    if match := _IDENTITY.fullmatch(body):
-        version, firmware, unit, rate_hz, delay_ms, kind = (int(group or "0", 16) for group in match.groups())
-        identity = Identity(
-            version=version, firmware=firmware, unit=unit, rate_hz=rate_hz, delay_ms=delay_ms, kind=kind
-        )
-        return identity if _possible(identity) else None
-    if match := _PULSE.fullmatch(body):
-        kind, number, bounces, milliseconds, microseconds = (int(group, 16) for group in match.groups())
-        pulse = Pulse(
-            input=kind & ~RISING,
-            rising=bool(kind & RISING),
-            number=number,
-            bounces=bounces,
-            milliseconds=milliseconds,
-            microseconds=microseconds,
-        )
-        return pulse if pulse.input in list(Input) and microseconds < 1000 else None
-    if match := _REFUSAL.fullmatch(body):
-        return Refusal(int(match[1], 16))
+    for form, make in _FORMS:
+        if match := form.fullmatch(body):
+            message = make(**{name: int(digits, 16) for name, digits in match.groupdict().items()})
+            return message if _possible(message) else None
     return None
 
 
-def _possible(identity: Identity) -> bool:
-    rate = identity.rate_hz
-    return (
-        identity.kind in list(SensorKind)
-        and MIN_RATE_HZ <= rate <= MAX_RATE_HZ
-        and identity.delay_ms <= 1000 / rate + MAX_SENDING_MS
-    )
+def _possible(message: Message) -> bool:
+    if isinstance(message, Sample):
+        return not (message.status & SampleStatus.FIRST and message.sequence)
+    if isinstance(message, Pulse):
+        return message.input in list(Input) and message.microseconds < 1000
+    if isinstance(message, Identity):
+        rate = message.rate_hz
+        kind_known, rate_known = message.kind in list(SensorKind), MIN_RATE_HZ <= rate <= MAX_RATE_HZ
+        return kind_known and rate_known and message.delay_ms <= 1000 / rate + MAX_SENDING_MS
+    return True
 
 
 # Multiple of the usual change from sample to sample that still counts as near.
@@ -313,6 +305,12 @@ def _change(a: Arrival, b: Arrival) -> float:
     return max(abs(b.sample.x - a.sample.x), abs(b.sample.y - a.sample.y))
 
 
+def clocks_agree(elapsed_ms: int, a: Arrival, b: Arrival) -> bool:
+    """Whether the device's clock went on between two arrivals about as the host's did."""
+    apart_s = b.moment.monotonic_s - a.moment.monotonic_s
+    return abs(elapsed_ms * 1e-3 - apart_s) <= HOST_TOLERANCE_S + HOST_TOLERANCE_SHARE * apart_s
+
+
 def mcu_follows(a: Arrival, b: Arrival, period_ms: float | None) -> bool:
     """Whether one sample may follow another in the same run of the MCU (period None: its rate is not known).
 
@@ -328,8 +326,7 @@ def mcu_follows(a: Arrival, b: Arrival, period_ms: float | None) -> bool:
     low, high = (SHORTEST_MS, LONGEST_MS) if period_ms is None else (period_ms, period_ms)
     if not low * ahead - PERIOD_TOLERANCE_MS <= elapsed <= high * ahead + PERIOD_TOLERANCE_MS:
         return False
-    apart_s = b.moment.monotonic_s - a.moment.monotonic_s
-    return abs(elapsed * 1e-3 - apart_s) <= HOST_TOLERANCE_S + HOST_TOLERANCE_SHARE * apart_s
+    return clocks_agree(elapsed, a, b)
 
 
 def _temperature_leaps(a: Sample, b: Sample) -> bool:
@@ -351,22 +348,19 @@ class Continuity:
         self._resumed = self._last is not None
 
     def follow(self, sample: Sample) -> Sample:
-        """Return the sample with its continued sequence, and `lost`, `restarted` and `resumed` filled in."""
-        last = self._last
-        lost, restarted, step = 0, False, 1
+        """Return the sample with its continued sequence, and `lost` and `broken` filled in."""
+        last, broken, step = self._last, self._resumed, 1
         if last is not None:
             elapsed = (sample.milliseconds - last.milliseconds) & 0xFFFFFFFF
             ahead = (sample.sequence - self._last_raw_sequence) & 0xFFFF
             # A serial line keeps the order: a clock that goes back, or a first sample, means a reset.
-            restarted = bool(sample.status & SampleStatus.FIRST) or elapsed >= 1 << 31
-            if restarted:
+            if sample.status & SampleStatus.FIRST or elapsed >= 1 << 31:
                 self.restarts += 1
+                broken = True
             else:
-                step = ahead or (1 if self._resumed else 1 << 16)
-                lost = step - 1
-                self.lost += lost
+                step = ahead or (1 if broken else 1 << 16)
+        self.lost += step - 1
         sequence = sample.sequence if last is None else (last.sequence + step) & 0xFFFFFFFF
-        self._last_raw_sequence = sample.sequence
-        self._last = replace(sample, sequence=sequence, lost=lost, restarted=restarted, resumed=self._resumed)
-        self._resumed = False
+        self._last_raw_sequence, self._resumed = sample.sequence, False
+        self._last = replace(sample, sequence=sequence, lost=step - 1, broken=broken)
         return self._last

@@ -6,14 +6,14 @@ import errno
 import fcntl
 import os
 import termios
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from collections.abc import Mapping
+from typing import Any, Generic, Protocol, TypeVar
 
 import serial
 
-from starpos_inclinometer.clock import HostClock, Moment
+from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.sources import mcu_protocol
-from starpos_inclinometer.sources.source import Arrival, Counts, Link, Phase
+from starpos_inclinometer.sources.source import Arrival, Counts, Link, Phase, Surroundings
 
 # How soon a stop, a command or silence is noticed.
 READ_TIMEOUT_S = 0.1
@@ -66,26 +66,18 @@ class Decoder(Protocol):
         """Whether the last bytes answered a command, so that the next command need not wait."""
 
 
-class SerialLink(Link):
+D = TypeVar("D", bound=Decoder)
+
+
+class SerialLink(Link, Generic[D]):
     """Reads the samples that come through a serial port.
 
-    port: use a stable path (/dev/serial/by-id/...); it is resolved at each opening, and opened exclusively.
-    clock: read once for each chunk of bytes.
+    values: the node's parameters; the port is resolved at each opening, and opened exclusively.
     """
 
-    def __init__(
-        self,
-        port: str,
-        baud: int,
-        decoder: Decoder,
-        clock: HostClock,
-        wake: Callable[[], object] = lambda: None,
-    ) -> None:
-        super().__init__(clock, wake, "serial link")
-        self._port = port
-        self._baud = baud
-        self._decoder = decoder
-        self._next_command = 0.0
+    def __init__(self, host: Surroundings, values: Mapping[str, Any], decoder: D) -> None:
+        super().__init__(host, values["port"])
+        self._baud, self._decoder, self._next_command = values["baud"], decoder, 0.0
 
     def _counts(self) -> Counts:
         return self._decoder.counts
@@ -103,7 +95,7 @@ class SerialLink(Link):
 
     def _open(self) -> serial.Serial:
         device = serial.Serial(
-            self._port, self._baud, timeout=READ_TIMEOUT_S, write_timeout=0.5, exclusive=True
+            self.name, self._baud, timeout=READ_TIMEOUT_S, write_timeout=0.5, exclusive=True
         )
         # pyserial's lock stops only programs that ask for it; this stops all but root's. A pseudo-terminal is left out:
         # it would stay locked after a reader was killed, as long as its other end is open.
@@ -133,20 +125,19 @@ class SerialLink(Link):
             patience = max(MIN_SILENCE_S, SILENT_PERIODS * self._decoder.period_s)
             if now - last_byte > patience:
                 self._enter(
-                    Phase.SILENT, f"{self._port} is open but silent: check the device's power and cable."
+                    Phase.SILENT, f"{self.name} is open but silent: check the device's power and cable."
                 )
                 if self._moved(device):
                     return
             elif now - last_line > patience:
                 self._enter(
                     Phase.GARBLED,
-                    f"{self._port} sends bytes but no valid lines at {self._baud} baud: "
-                    + self._decoder.hint,
+                    f"{self.name} sends bytes but no valid lines at {self._baud} baud: " + self._decoder.hint,
                 )
             elif now - last_sample > UNFIT_PATIENCES * patience:
                 self._enter(
                     Phase.GARBLED,
-                    f"{self._port} sends lines that do not fit one another: check cable and grounding.",
+                    f"{self.name} sends lines that do not fit one another: check cable and grounding.",
                 )
 
     def _receive(self, data: bytes, moment: Moment) -> tuple[bool, bool]:
@@ -159,25 +150,25 @@ class SerialLink(Link):
             self._next_command = 0.0
         if arrivals:
             samples = [a for a in arrivals if not isinstance(a.sample, mcu_protocol.Pulse)]
-            self._admit(arrivals, [moment.monotonic_s] * len(samples), f"receiving from {self._port}")
+            self._admit(arrivals, [moment.monotonic_s] * len(samples), f"receiving from {self.name}")
         return lines, bool(arrivals)
 
     def _moved(self, device: serial.Serial) -> bool:
         """Whether the path now leads to another device than the open one; OSError if it leads nowhere."""
-        return os.stat(self._port).st_rdev != os.fstat(device.fileno()).st_rdev
+        return os.stat(self.name).st_rdev != os.fstat(device.fileno()).st_rdev
 
     def _explain(self, error: Exception, opened: bool) -> str:
         code = getattr(error, "errno", None)
         if opened:
-            return f"{self._port} went away: plug the inclinometer in again; it is retried."
+            return f"{self.name} went away: plug the inclinometer in again; it is retried."
         if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-            return f"{self._port} is not there: plug the inclinometer in, or set `port`; it is retried."
+            return f"{self.name} is not there: plug the inclinometer in, or set `port`; it is retried."
         if code in (errno.EACCES, errno.EPERM):
-            return f"{self._port} may not be opened: add the user to its group (dialout); it is retried."
+            return f"{self.name} may not be opened: add the user to its group (dialout); it is retried."
         if code in (errno.EAGAIN, errno.EBUSY):
-            return f"{self._port} is in use by another process: end that one; it is retried."
+            return f"{self.name} is in use by another process: end that one; it is retried."
         text = " ".join(str(error).split())
-        return f"{self._port} is no usable serial port ({text}): set `port` to the device; it is retried."
+        return f"{self.name} is no usable serial port ({text}): set `port` to the device; it is retried."
 
 
 def _close(device: serial.Serial) -> None:

@@ -7,7 +7,7 @@ A new sensor is a TiltSource in a module here, and a line in `registry`.
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
@@ -97,87 +97,6 @@ class Surroundings:
     wake: Callable[[], object]
 
 
-class Link:
-    """A device that a thread reads until `stop`, and opens again when it comes back.
-
-    clock: read at least once a second.
-    wake: called from the thread when there is something to fetch or the phase changed; it must be quick.
-    """
-
-    def __init__(self, clock: HostClock, wake: Callable[[], object], name: str) -> None:
-        self._clock, self._wake = clock, wake
-        self._queue: deque[Arrival] = deque(maxlen=QUEUE)
-        self._recent: deque[float] = deque(maxlen=QUEUE)
-        # Of all that both threads use.
-        self._lock = threading.Lock()
-        self._phase, self._sentence = Phase.ABSENT, "the device has not been opened yet"
-        self._connections = self._dropped = 0
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Close the device and end the thread, soon."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5.0)
-
-    def fetch(self) -> list[Arrival]:
-        """Return what has arrived since the last call, in order."""
-        with self._lock:
-            arrivals = list(self._queue)
-            self._queue.clear()
-        return arrivals
-
-    def health(self) -> Health:
-        with self._lock:
-            horizon = self._clock.monotonic_s() - RATE_WINDOW_S
-            recent = [t for t in self._recent if t >= horizon]
-            span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
-            return Health(
-                phase=self._phase,
-                sentence=self._sentence,
-                rate_hz=(len(recent) - 1) / span if span > 0 and self._phase is Phase.RECEIVING else 0.0,
-                counts=self._counts(),
-                step=self._clock.step,
-                values={"openings": self._connections, "unfetched samples": self._dropped},
-            )
-
-    def _counts(self) -> Counts:
-        raise NotImplementedError
-
-    # All that follows runs in the thread.
-
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            self._serve()
-            self._clock.read()
-            self._stop.wait(RETRY_S)
-
-    def _serve(self) -> None:
-        """Open the device and read it until the link is stopped, or the device has gone; never raises."""
-        raise NotImplementedError
-
-    def _admit(self, arrivals: list[Arrival], measured_s: list[float], sentence: str) -> None:
-        """Queue arrivals; measured_s: the monotonic times of those that count for the rate."""
-        with self._lock:
-            for arrival in arrivals:
-                self._dropped += len(self._queue) == QUEUE
-                self._queue.append(arrival)
-            self._recent.extend(measured_s)
-        self._enter(Phase.RECEIVING, sentence)
-        self._wake()
-
-    def _enter(self, phase: Phase, sentence: str) -> None:
-        with self._lock:
-            changed = (phase, sentence) != (self._phase, self._sentence)
-            self._phase, self._sentence = phase, sentence
-        if changed:
-            self._wake()
-
-
 class TiltSource:
     """A source of tilts, made as SourceClass(host, values) from the node's parameters.
 
@@ -220,25 +139,91 @@ class TiltSource:
         raise NotImplementedError
 
 
-class LinkSource(TiltSource):
-    """A source whose device a `Link` reads."""
+class Link(TiltSource):
+    """A source whose device a thread reads until `stop`, and opens again when it comes back.
 
-    _link: Link
+    host: its clock is read at least once a second; `wake` is called from the thread when there is something to fetch or
+    the phase changed, and must be quick.
+    """
+
+    def __init__(self, host: Surroundings, name: str) -> None:
+        self.name, self._clock, self._wake = name, host.clock, host.wake
+        self._queue: deque[Arrival] = deque(maxlen=QUEUE)
+        self._recent: deque[float] = deque(maxlen=QUEUE)
+        # Of all that both threads use.
+        self._lock = threading.Lock()
+        self._phase, self._sentence = Phase.ABSENT, "the device has not been opened yet"
+        self._connections = self._dropped = 0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
-        self._link.start()
+        self._thread.start()
 
     def stop(self) -> None:
-        self._link.stop()
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+
+    def arrivals(self) -> list[Arrival]:
+        """Return what has arrived since the last call, in order."""
+        with self._lock:
+            arrivals = list(self._queue)
+            self._queue.clear()
+        return arrivals
 
     def health(self) -> Health:
-        health = self._link.health()
-        return replace(health, complaint=self._complaint(), values={**health.values, **self._values()})
+        with self._lock:
+            horizon = self._clock.monotonic_s() - RATE_WINDOW_S
+            recent = [t for t in self._recent if t >= horizon]
+            span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
+            values = {"openings": self._connections, "unfetched samples": self._dropped, **self._shown()}
+            return Health(
+                phase=self._phase,
+                sentence=self._sentence,
+                rate_hz=(len(recent) - 1) / span if span > 0 and self._phase is Phase.RECEIVING else 0.0,
+                counts=self._counts(),
+                complaint=self._complaint(),
+                step=self._clock.step,
+                values=values,
+            )
+
+    def _counts(self) -> Counts:
+        raise NotImplementedError
 
     def _complaint(self) -> str:
         """What is wrong although samples come; '' for nothing."""
         return ""
 
-    def _values(self) -> Mapping[str, object]:
+    def _shown(self) -> Mapping[str, object]:
         """What diagnostics show besides the link."""
         return {}
+
+    # All that follows runs in the thread.
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            self._serve()
+            self._clock.read()
+            self._stop.wait(RETRY_S)
+
+    def _serve(self) -> None:
+        """Open the device and read it until the link is stopped, or the device has gone; never raises."""
+        raise NotImplementedError
+
+    def _admit(self, arrivals: list[Arrival], measured_s: list[float], sentence: str) -> None:
+        """Queue arrivals; measured_s: the monotonic times of those that count for the rate."""
+        with self._lock:
+            for arrival in arrivals:
+                self._dropped += len(self._queue) == QUEUE
+                self._queue.append(arrival)
+            self._recent.extend(measured_s)
+        self._enter(Phase.RECEIVING, sentence)
+        self._wake()
+
+    def _enter(self, phase: Phase, sentence: str) -> None:
+        with self._lock:
+            changed = (phase, sentence) != (self._phase, self._sentence)
+            self._phase, self._sentence = phase, sentence
+        if changed:
+            self._wake()

@@ -7,15 +7,12 @@ Sources: data sheets SCA100T series (Murata 8261800 rev. B2), AD7730/AD7730L (An
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from starpos.instrument import sensors
 from starpos.instrument.inclinometer import (
     SCA100T_NOISE_RAD,
-    SCA100T_OFFSET_V,
     SCA100T_RANGE_RAD,
-    SCA100T_SENSITIVITY_V_PER_G,
 )
 from starpos.instrument.tilt_log import NoiseTracker
 from starpos.messages.tilt import GAP, OUT_OF_RANGE, SATURATED, STUCK, Reading
@@ -187,8 +184,6 @@ CODE_MAX = (1 << 24) - 1
 # The +-80 mV range holds at a 5 V reference (mode register, HIREF = 1) and follows the reference.
 ADC_RANGE_V = 0.080
 ADC_NOMINAL_REFERENCE_V = 5.0
-# 30 kohm to 1 kohm: the whole output, 2.5 +- 2.48 V, on +-80 mV.
-DIVIDER = 31.0
 # The SCA100T's temperature (SPI command RWTR): T = (counts - 197) / -1.083 deg C.
 SCA100T_ZERO_COUNTS = 197
 SCA100T_COUNTS_PER_C = -1.083
@@ -198,64 +193,17 @@ SCA100T_COUNTS_PER_C = -1.083
 SCA100T_STUCK_SAMPLES, SCA100T_STUCK_PAIRS = 10, 3
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sca100tCalibration:
-    """Calibration from codes to angles; pairs are (x, y).
-
-    The ADC's AIN(-) and the foot of the divider are at half the reference, which is also the supply of the sensor. So
-    the codes do not depend on the supply; the voltages here hold for a supply of reference_volts.
-    """
-
-    offset_volts: tuple[float, float] = (SCA100T_OFFSET_V, SCA100T_OFFSET_V)
-    sensitivity_volts_per_g: tuple[float, float] = (SCA100T_SENSITIVITY_V_PER_G, SCA100T_SENSITIVITY_V_PER_G)
-    divider: float = DIVIDER
-    reference_volts: float = ADC_NOMINAL_REFERENCE_V
-    # With t = T - reference: offset + c1 t + c2 t^2 + c3 t^3 [V], sensitivity (1 + c1 t + c2 t^2 + c3 t^3), for x and y.
-    temperature_reference_c: float = 25.0
-    offset_per_c: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),) * 2
-    sensitivity_per_c: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),) * 2
-
-    @property
-    def volts_per_code(self) -> float:
-        """Change of the sensor's output voltage for one code."""
-        full_scale = ADC_RANGE_V * self.reference_volts / ADC_NOMINAL_REFERENCE_V
-        return self.divider * full_scale / CODE_ZERO
-
-    @property
-    def compensates(self) -> bool:
-        """Whether the temperature matters."""
-        return any(any(c) for c in (*self.offset_per_c, *self.sensitivity_per_c))
-
-    def volts(self, code: int) -> float:
-        """Convert a code to the sensor's output voltage."""
-        return self.reference_volts / 2 + (code - CODE_ZERO) * self.volts_per_code
-
-    def offset_and_sensitivity(self, axis: int, temperature_c: float) -> tuple[float, float]:
-        """Offset (V) and sensitivity (V/g) of an axis at a temperature."""
-        t = temperature_c - self.temperature_reference_c
-        share = 1.0 + _cubic(self.sensitivity_per_c[axis], t)
-        # A polynomial far outside its fitted range must not reverse the axis.
-        share = min(max(share, 0.5), 2.0)
-        offset = self.offset_volts[axis] + _cubic(self.offset_per_c[axis], t)
-        return offset, self.sensitivity_volts_per_g[axis] * share
-
-    def axis_g(self, axis: int, code: int, temperature_c: float) -> float:
-        """Acceleration of an axis in g, limited to +-1; beyond, it has no angle and the sample is out of range anyway."""
-        offset, sensitivity = self.offset_and_sensitivity(axis, temperature_c)
-        return min(max((self.volts(code) - offset) / sensitivity, -1.0), 1.0)
-
-
 class BoardSensor(SensorTilts):
-    """A sensor on a board of starpos, whose samples hold codes.
+    """A sensor on a board of starpos, whose samples hold codes."""
 
-    faults: bits of a sample's status under which its codes mean nothing.
-    """
-
-    faults: int = FAULTS
-
-    def __init__(self, *limits: Any) -> None:
+    def __init__(self, values: Mapping[str, Any], *limits: Any) -> None:
         super().__init__(*limits)
         self.temperature = Temperature()
+        self.configure(values)
+
+    def configure(self, values: Mapping[str, Any]) -> None:
+        self.cross_axis = tuple(values["cross_axis"])
+        self.noise_floor_rad = noise_floor_rad(values)
 
     def measure(self, sample: Sample, time_s: float, stamp_ns: int = 0) -> Reading:
         """Convert a sample taken at `time_s` of a clock that does not step."""
@@ -263,9 +211,13 @@ class BoardSensor(SensorTilts):
         if sample.status & SampleStatus.NO_TEMPERATURE:
             celsius = math.nan
         self.temperature.observe(time_s, celsius)
-        flags = GAP if sample.lost or sample.restarted or sample.resumed else 0
-        if sample.status & self.faults:
+        flags = GAP if sample.lost or sample.broken else 0
+        if sample.status & (FAULTS | SampleStatus.SELF_TEST):
             flags |= STUCK
+        if sample.status & SampleStatus.UPSIDE_DOWN:
+            flags |= OUT_OF_RANGE
+        if {sample.x, sample.y} & {0, CODE_MAX}:
+            flags |= SATURATED
         angles, steps = self._angles(sample)
         return self.reading(
             angles,
@@ -274,7 +226,7 @@ class BoardSensor(SensorTilts):
             stamp_ns=stamp_ns,
             sequence=sample.sequence,
             temperature_c=celsius,
-            flags=flags | self._flags(sample),
+            flags=flags,
             codes=(sample.x, sample.y),
             shift=self._shift(sample),
         )
@@ -287,47 +239,69 @@ class BoardSensor(SensorTilts):
         """Elevations of the sensor's own axes, and their steps, rad."""
         raise NotImplementedError
 
-    def _flags(self, sample: Sample) -> int:
-        """Flags of the sample that only this sensor has."""
-        raise NotImplementedError
-
     def _shift(self, sample: Sample) -> tuple[float, float]:
         """Change of the tilt (rad) if the temperature is 1 sigma off."""
         return 0.0, 0.0
 
 
 class Sca100t(BoardSensor):
-    """An SCA100T-D01 behind an AD7730."""
+    """An SCA100T-D01 behind an AD7730, calibrated by the node's parameters.
 
-    def __init__(self, calibration: Sca100tCalibration = Sca100tCalibration()) -> None:
-        super().__init__(SCA100T_NOISE_RAD, SCA100T_RANGE_RAD, SCA100T_STUCK_PAIRS, SCA100T_STUCK_SAMPLES)
-        self.calibration = calibration
+    The ADC's AIN(-) and the foot of the divider are at half the reference, which is also the supply of the sensor. So
+    the codes do not depend on the supply; the voltages here hold for a supply of reference_volts.
+    """
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        limits = SCA100T_NOISE_RAD, SCA100T_RANGE_RAD, SCA100T_STUCK_PAIRS, SCA100T_STUCK_SAMPLES
+        super().__init__(values, *limits)
+
+    def configure(self, values: Mapping[str, Any]) -> None:
+        super().configure(values)
+        self._offset_volts, self._sensitivity_volts_per_g = values["offset_volts"], values["sensitivity"]
+        self._reference_volts, self._reference_c = values["reference_volts"], values["temperature.reference"]
+        full_scale = ADC_RANGE_V * self._reference_volts / ADC_NOMINAL_REFERENCE_V
+        # Change of the sensor's output voltage for one code.
+        self.volts_per_code = values["divider"] * full_scale / CODE_ZERO
+        # With t = T - reference: offset + c1 t + c2 t^2 + c3 t^3 [V], sensitivity (1 + c1 t + c2 t^2 + c3 t^3).
+        self._offset_per_c, self._sensitivity_per_c = (
+            [values[f"temperature.{name}_{axis}"] for axis in "xy"] for name in ("offset", "sensitivity")
+        )
+
+    def volts(self, code: int) -> float:
+        return self._reference_volts / 2 + (code - CODE_ZERO) * self.volts_per_code
+
+    def offset_and_sensitivity(self, axis: int, celsius: float) -> tuple[float, float]:
+        """Offset (V) and sensitivity (V/g) of an axis at a temperature."""
+        t = celsius - self._reference_c
+        # A polynomial far outside its fitted range must not reverse the axis.
+        share = min(max(1.0 + _cubic(self._sensitivity_per_c[axis], t), 0.5), 2.0)
+        offset = self._offset_volts[axis] + _cubic(self._offset_per_c[axis], t)
+        return offset, self._sensitivity_volts_per_g[axis] * share
 
     def _celsius(self, counts: int) -> float:
         return (counts - SCA100T_ZERO_COUNTS) / SCA100T_COUNTS_PER_C
 
     def _angles(self, sample: Sample) -> tuple[tuple[float, float], tuple[float, float]]:
-        c = self.calibration
-        x, y = self._angles_at(sample, self.temperature.celsius(c.temperature_reference_c))
+        x, y = self._angles_at(sample, self.temperature.celsius(self._reference_c))
         # The step of the sine over its slope.
         sx, sy = (
-            c.volts_per_code / c.sensitivity_volts_per_g[axis] / max(math.cos(angle), 0.1)
+            self.volts_per_code / self._sensitivity_volts_per_g[axis] / max(math.cos(angle), 0.1)
             for axis, angle in enumerate((x, y))
         )
         return (x, y), (sx, sy)
 
     def _angles_at(self, sample: Sample, celsius: float) -> tuple[float, float]:
-        c = self.calibration
-        return math.asin(c.axis_g(0, sample.x, celsius)), math.asin(c.axis_g(1, sample.y, celsius))
+        return self._angle(0, sample.x, celsius), self._angle(1, sample.y, celsius)
 
-    def _flags(self, sample: Sample) -> int:
-        return SATURATED if {sample.x, sample.y} & {0, CODE_MAX} else 0
+    def _angle(self, axis: int, code: int, celsius: float) -> float:
+        """Elevation of an axis, rad. Beyond +-1 g it has none, and the sample is out of range anyway."""
+        offset, sensitivity = self.offset_and_sensitivity(axis, celsius)
+        return _asin((self.volts(code) - offset) / sensitivity)
 
     def _shift(self, sample: Sample) -> tuple[float, float]:
-        if not self.calibration.compensates:
+        if not any(map(any, (*self._offset_per_c, *self._sensitivity_per_c))):
             return 0.0, 0.0
-        at = self.temperature.celsius(self.calibration.temperature_reference_c)
-        sigma = self.temperature.stddev_c
+        at, sigma = self.temperature.celsius(self._reference_c), self.temperature.stddev_c
         here, low, high = (self.turned(self._angles_at(sample, t)) for t in (at, at - sigma, at + sigma))
         # To the side with the larger change.
         return max(((x - here[0], y - here[1]) for x, y in (low, high)), key=lambda d: math.hypot(*d))
@@ -345,10 +319,8 @@ SCL3300_STUCK_PAIRS = 50
 class Scl3300(BoardSensor):
     """An SCL3300-D01, which measures at any lean."""
 
-    faults = FAULTS | SampleStatus.SELF_TEST
-
-    def __init__(self) -> None:
-        super().__init__(sensors.presets()["scl3300"].noise_rad, math.pi / 2, SCL3300_STUCK_PAIRS)
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values, sensors.presets()["scl3300"].noise_rad, math.pi / 2, SCL3300_STUCK_PAIRS)
 
     def _celsius(self, counts: int) -> float:
         return (counts + SCL3300_ZERO_COUNTS + 0.5) * SCL3300_STEP_C - 273
@@ -357,11 +329,8 @@ class Scl3300(BoardSensor):
         x, y = ((code - CODE_ZERO) * SCL3300_RAD_PER_CODE for code in (sample.x, sample.y))
         return (x, y), (SCL3300_STEP_RAD, SCL3300_STEP_RAD)
 
-    def _flags(self, sample: Sample) -> int:
-        return OUT_OF_RANGE if sample.status & SampleStatus.UPSIDE_DOWN else 0
 
-
-def _cubic(coefficients: tuple[float, float, float], t: float) -> float:
+def _cubic(coefficients: Sequence[float], t: float) -> float:
     c1, c2, c3 = coefficients
     return t * (c1 + t * (c2 + t * c3))
 

@@ -57,6 +57,11 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
     `poses` is the number of directions, `left_out` the frames of those that disagree.
     Raises FixError if there are fewer than three directions, or two without `near`, or if they leave two places.
     """
+    return _solved(circles, near)[0]
+
+
+def _solved(circles: Sequence[Circle], near: tuple[float, float] | None) -> tuple[Average, float]:
+    """The place as `place_of_circles` has it, and how badly circles, and a way from near, fit: in sigma, squared."""
     whole = Directions.of(sorted(circles, key=lambda c: c.utc_unix_s))
     number = len(whole.covariance)
     if number < 2 or (number == 2 and near is None):
@@ -66,7 +71,10 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
             + (", or two and --near LAT LON, because two circles meet in two places" if number == 2 else "")
         )
     part = whole.subset(_sound(whole))
-    return _average(part, _answer(part, near), len(circles))
+    answer = _answer(part, near)
+    away = 0.0 if near is None else np.arccos(np.clip(answer.zenith @ zenith_of(*near), -1, 1)) / NEAR_RAD
+    misfit = answer.chi2 + (number - len(part.circles)) * OUTLIER_SIGMA**2 + away**2
+    return _average(part, answer, len(circles)), float(misfit)
 
 
 def place_of_discs(circles: Sequence[Circle], near: tuple[float, float] | None = None) -> tuple[Average, str]:
@@ -78,30 +86,19 @@ def place_of_discs(circles: Sequence[Circle], near: tuple[float, float] | None =
     for name, choice in ((SUN, circles), (MOON, [c.instead for c in circles if c.instead is not None])):
         if len(choice) == len(circles):
             try:
-                place = place_of_circles(choice, near)
+                found.append((*_solved(choice, near), name))
             except FixError as error:
                 why = why or error
-                continue
-            found.append((_misfit(choice, place, near), place, name))
     if not found:
         assert why is not None
         raise why
-    found.sort(key=lambda f: f[0])
-    if len(found) > 1 and found[1][0] - found[0][0] < EXCLUDED_SIGMA**2:
+    found.sort(key=lambda f: f[1])
+    if len(found) > 1 and found[1][1] - found[0][1] < EXCLUDED_SIGMA**2:
         raise FixError(
             "the discs may be the Sun's or the Moon's, whose circles meet both: go on for some hours, or say where you "
             "are with --near LAT LON"
         )
-    return found[0][1:]
-
-
-def _misfit(circles: Sequence[Circle], place: Average, near: tuple[float, float] | None) -> float:
-    """Sum of the squared residuals of circles at a place, in sigma, outliers' cut off, and of its way from near."""
-    whole = Directions.of(sorted(circles, key=lambda c: c.utc_unix_s))
-    zenith = zenith_of(place.latitude, place.longitude)
-    off2 = whole.residual(zenith)[0] ** 2 / np.diag(whole.covariance)
-    away = 0.0 if near is None else np.arccos(np.clip(zenith @ zenith_of(*near), -1, 1)) / NEAR_RAD
-    return float(np.minimum(off2, OUTLIER_SIGMA**2).sum() + away**2)
+    return found[0][0], found[0][2]
 
 
 @at_once
@@ -130,12 +127,11 @@ class Directions:
 
     @property
     def covariance(self) -> np.ndarray:
-        return np.sum(list(self.sources.values()), axis=0)
+        return self.without()
 
-    @staticmethod
-    def east_north(zenith: np.ndarray) -> np.ndarray:
-        """East and north (2, 3) in ITRS at a zenith (3,), along which the derivatives of `residual` are."""
-        return _enu(zenith)[:2]
+    def without(self, source: str = "") -> np.ndarray:
+        """The covariance (D, D) without that of one source."""
+        return np.sum([c for name, c in self.sources.items() if name != source], axis=0)
 
     @property
     def wide(self) -> bool:
@@ -166,7 +162,7 @@ class Directions:
             measured = np.array([c.zenith_distance for c in every])
         nearer = np.array([c.parallax for c in every])[:, None] * ground_m(zenith) / EQUATOR_RADIUS_M
         v = rotation.normalised(np.array([c.itrs for c in every]) - nearer + station_velocity(zenith))
-        axes = _enu(zenith)
+        axes = enu_at(zenith)
         local = v @ axes.T
         sine = np.hypot(local[:, 0], local[:, 1])
         slope = -local[:, :2] / np.maximum(sine, 1e-12)[:, None]
@@ -330,7 +326,7 @@ def _refined(part: Directions, weight: np.ndarray, zenith: np.ndarray) -> _Answe
         if np.linalg.norm(step) < SETTLED:
             return _Answer(zenith, gain, float(left @ weight @ left))
         step *= min(1.0, 0.3 / np.linalg.norm(step))
-        zenith = rotation.normalised(zenith + step @ _enu(zenith)[:2])
+        zenith = rotation.normalised(zenith + step @ enu_at(zenith)[:2])
     return None
 
 
@@ -373,11 +369,6 @@ def _average(part: Directions, answer: _Answer, frames: int) -> Average:
     )
 
 
-def f_quantile(free: int, share: float) -> float:
-    """Quantile of the F distribution with 2 and `free` degrees of freedom; to import scipy.special takes 80 ms."""
-    return free / 2 * float((1 - share) ** (-2 / free) - 1)
-
-
 def excess(chi2: float, free: int) -> float:
     """Variance beyond the stated one, as a share of it, for residuals that scatter more than stated.
 
@@ -385,11 +376,12 @@ def excess(chi2: float, free: int) -> float:
     """
     if free < 1 or chi2 <= free:
         return 0.0
-    # the ellipse that holds a share WITHIN, over the ellipse of a known scatter
-    wide = f_quantile(max(free, 2), WITHIN) / -np.log(1 - WITHIN)
-    return float((chi2 / free - 1) * wide)
+    beyond, free = chi2 / free - 1, max(free, 2)
+    # the ellipse that holds a share WITHIN, by the F distribution with 2 and `free`, over the ellipse of a known scatter
+    wide = free / 2 * ((1 - WITHIN) ** (-2 / free) - 1) / -np.log(1 - WITHIN)
+    return float(beyond * wide)
 
 
-def _enu(zenith: np.ndarray) -> np.ndarray:
+def enu_at(zenith: np.ndarray) -> np.ndarray:
     """East, north and up (3, 3) in ITRS at a zenith (3,)."""
     return enu_axes(*place_of_zenith(zenith))

@@ -15,7 +15,7 @@ from starpos.averaging.scatter import MAX_ROWS, Frames, Scatter, scatter_of
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.errors import FixError
-from starpos.fix.fix import Fix, PlaceFix
+from starpos.fix.fix import Fix, PlaceFix, zenith_variance
 from starpos.fix.terms import EACH_POSE, ErrorTerm
 from starpos.frozen import at_once
 from starpos.rotation import half_turn
@@ -71,8 +71,8 @@ class Remembered:
             place=plane.coordinates(f)[:2],
             to_rad=np.linalg.inv(turn @ f.levelling[:3]),
             shared=np.hstack(factors),
-            sigma=_sigma(own),
-            pose_sigma=_sigma(new),
+            sigma=math.sqrt(zenith_variance(own)),
+            pose_sigma=math.sqrt(zenith_variance(new)),
         )
 
     def with_next(self, other: "Remembered") -> "Remembered":
@@ -86,10 +86,6 @@ class Remembered:
             place=a * self.place + b * other.place,
             sigma=float(np.hypot(a * self.sigma, b * other.sigma)),
         )
-
-
-def _sigma(terms: Sequence[ErrorTerm]) -> float:
-    return float(np.sqrt(sum(np.trace(t.covariance[:2, :2]) for t in terms) / 2)) / EARTH_RADIUS_M
 
 
 @at_once
@@ -345,18 +341,13 @@ class _Track:
     def before(cls, f: Fix, frame_sigma: float) -> "_Track":
         """A track without a fix, ready for fixes like `f`; frame_sigma (rad): their scatter beyond their budgets."""
         place_filter = PlaceFilter.before(_with_scatter(f, frame_sigma))
-        return cls(
-            place_filter=place_filter, pose=f, claim=Claim(frame_sigma=frame_sigma), began_unix_s=f.utc_unix_s
-        )
+        claim = Claim(frame_sigma=frame_sigma)
+        return cls(place_filter=place_filter, pose=f, claim=claim, began_unix_s=f.utc_unix_s)
 
     def rival(self, f: Fix) -> "_Track":
         """A track without a fix that knows the errors of this one, but not its place."""
-        return _Track(
-            place_filter=self.place_filter.elsewhere(self._scattered(f)),
-            pose=self.pose,
-            claim=Claim(frame_sigma=self.claim.frame_sigma),
-            began_unix_s=f.utc_unix_s,
-        )
+        elsewhere = self.place_filter.elsewhere(self._scattered(f))
+        return replace(_Track.before(f, self.claim.frame_sigma), place_filter=elsewhere, pose=self.pose)
 
     def touched(self, f: Fix) -> "_Track":
         """The track after somebody touched the camera; `f` is the first fix since."""

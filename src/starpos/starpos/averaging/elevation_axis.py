@@ -13,6 +13,7 @@ from starpos.averaging.altitudes import (
     MIN_JUDGED,
     OUTLIER_SIGMA,
     Directions,
+    enu_at,
     excess,
     starts,
     usual_sigma,
@@ -26,12 +27,11 @@ from starpos.instrument.instrument import UNKNOWN_ARCSEC, Calibration
 from starpos.instrument.mounting import angles_at
 from starpos.units import ARCSEC
 
-# rounds of weights that follow the residuals
-REWEIGHTED = 20
 # rounds of refractions and errors that follow A3, until it moves by less (rad)
 RELINEARISED, SAME_AXIS_RAD = 8, 1e-7
-MAX_STEP_RAD = 0.3
-AXIS_ROUNDS, SETTLED_CHI2, FIRST_DAMPING, LAST_DAMPING = 80, 1e-6, 1e-3, 1e9
+SETTLED = 1e-12
+# residual in sigma of an axis that some frames cannot have
+IMPOSSIBLE = 1e12
 # an axis that is known better than this (rad) is known
 MIN_RAD = 1e-9
 # number of zeniths that are tried, the ones that fit best at first
@@ -157,8 +157,7 @@ def _axes(circles_of: CirclesOf, given: Calibration, ray: np.ndarray, site: Plac
         first = Directions.of(sorted(circles_of(given.a3), key=lambda c: c.utc_unix_s))
         tried = sorted(starts(first), key=lambda z: float(np.median(np.abs(first.residual(z)[0]))))
         zeniths = [*_round(first), *tried[:TRIED]]
-    sigma = None if site is None else site.plumb_stddev
-    found = [_fitted(circles_of, given, ray, zenith, sigma) for zenith in zeniths]
+    found = [_fitted(circles_of, given, ray, zenith, site) for zenith in zeniths]
     if not any(found):
         raise FixError(
             "the elevations do not determine A3: check the tilts, the clock and that nothing was moved"
@@ -170,24 +169,18 @@ def _contradicting(best: FoundAxis, given: Calibration, site: Place | None) -> s
     """Times of the frames whose directions contradict the others; none if they are too few to judge, or too many.
 
     They are judged from the least sum of residuals instead of squares, which a blunder does not pull towards itself
-    (Bloomfield and Steiger, Least Absolute Deviations, 1983), by weights that follow the residuals.
+    (Bloomfield and Steiger, Least Absolute Deviations, 1983).
     """
     number, free = best.directions, best.directions - (2 if site is not None else 4)
     if number < MIN_JUDGED or best.off.max() < OUTLIER_SIGMA:
         return set()
-    sigma = None if site is None else site.plumb_stddev
-    problem = _Problem(best.a3, best.circles, given, best.ray, sigma)
-    off, a3, zenith = best.off, best.a3, best.zenith
-    for _ in range(REWEIGHTED):
-        problem.doubt = np.maximum(off - 1, 0.0)
-        robust = problem.descended(a3, zenith)
-        if robust is None:
-            return set()
-        off, a3, zenith = robust.off, robust.a3, robust.zenith
-    wrong = np.flatnonzero(off > OUTLIER_SIGMA * max(usual_sigma(off, free), 1.0))
+    robust = _solved(best.a3, best.zenith, best.circles, given, best.ray, site, robust=True)
+    if robust is None:
+        return set()
+    wrong = np.flatnonzero(robust.off > OUTLIER_SIGMA * max(usual_sigma(robust.off, free), 1.0))
     if len(wrong) > MAX_OUTLIERS * number:
         return set()
-    return {c.utc_unix_s for k in wrong for c in problem.part.circles[k]}
+    return {c.utc_unix_s for k in wrong for c in Directions.of(best.circles).circles[k]}
 
 
 def _known(given: Calibration, axis: np.ndarray, across: np.ndarray) -> np.ndarray:
@@ -216,87 +209,76 @@ def _slope(circle: Circle, across: np.ndarray) -> np.ndarray:
     return -(across @ circle.up) / max(np.sin(circle.zenith_distance), 1e-9)
 
 
-class _Problem:
-    """The circles about an A3 (3, 3), of which refraction and errors stay as they are while the axis moves a little.
+def _solved(
+    a3: np.ndarray,
+    zenith: np.ndarray,
+    circles: Sequence[Circle],
+    given: Calibration,
+    ray: np.ndarray,
+    site: Place | None,
+    robust: bool = False,
+) -> FoundAxis | None:
+    """The least chi-square near an A3 (3, 3) and a zenith; None for an axis that some frames cannot have.
 
-    stated (D, D): without A3's error; doubt (D,): variance beyond it, as a share; bent (N,): the refractions.
-    zenith_sigma: None if the zenith is unknown.
+    circles: about that A3; their refraction and errors stay as they are while the axis moves a little.
+    robust: by the sum of the residuals rather than of their squares.
+    Axis and zenith together lie in a narrow, bent valley where the sensor leans about alike in all directions.
     """
+    from scipy.optimize import least_squares
 
-    def __init__(
-        self,
-        a3: np.ndarray,
-        circles: Sequence[Circle],
-        given: Calibration,
-        ray: np.ndarray,
-        zenith_sigma: float | None,
-    ) -> None:
-        self.circles, self.given, self.ray, self.zenith_sigma = circles, given, ray, zenith_sigma
-        self.part, self.up = Directions.of(circles), np.array([c.up for c in circles])
-        self.bent = np.array([c.zenith_distance for c in circles]) - _seen(self.up, a3 @ ray)
-        self.stated = np.sum([c for name, c in self.part.sources.items() if name != OF_A3], axis=0)
-        self.doubt: np.ndarray | float = 0.0
+    part, up = Directions.of(circles), np.array([c.up for c in circles])
+    start = rotation.normalised(a3 @ ray)
+    bent = np.array([c.zenith_distance for c in circles]) - _seen(up, start)
+    across, along = np.linalg.svd(start[None])[2][1:], enu_at(zenith)[:2]
+    stated, known = part.without(OF_A3), _known(given, start, across)
+    if site is not None:
+        of_zenith = part.residual(zenith, _seen(up, start) + bent)[1]
+        stated = stated + site.plumb_stddev**2 * of_zenith @ of_zenith.T
+    sigma = np.sqrt(np.diag(stated))
+    each = np.diag(np.diag(stated)) if robust else stated
+    white, prior = (np.linalg.inv(np.linalg.cholesky(c)) for c in (each, known))
 
-    def at(self, a3: np.ndarray, zenith: np.ndarray) -> "_Normal | None":
-        """Linearise at an A3 and a zenith; None for an axis that some frames cannot have."""
-        axis = a3 @ self.ray
-        seen, stated = _seen(self.up, axis), self.stated
+    def moved(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        there = zenith + x[2:] @ along[: len(x) - 2]
+        return rotation.normalised(start + x[:2] @ across), rotation.normalised(there)
+
+    def left(x: np.ndarray) -> np.ndarray:
+        axis, there = moved(x)
+        return part.residual(there, _seen(up, axis) + bent)[0]
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        seen = _seen(up, moved(x)[0])
         if np.sin(seen).min() < MIN_SINE or np.cos(seen).min() < MIN_COS_ZENITH:
-            return None
-        left, of_zenith = self.part.residual(zenith, seen + self.bent)
-        across = np.linalg.svd(axis[None])[2][1:]
-        slope = self.part.mean(self.up @ across.T / np.sin(seen)[:, None])
-        if self.zenith_sigma is None:
-            slope = np.hstack([slope, of_zenith])
-        else:
-            stated = stated + self.zenith_sigma**2 * of_zenith @ of_zenith.T
+            return np.full(len(white) + 2, IMPOSSIBLE)
         # how far the axis is from where it was given, in units of what is known of it
-        prior = np.linalg.inv(_known(self.given, axis, across))
-        off = across @ (axis - self.given.a3 @ self.ray)
-        doubted = np.diag(np.diag(stated) * self.doubt)
-        weighted = np.linalg.solve(stated + doubted, np.column_stack([left, slope]))
-        matrix, pull = slope.T @ weighted[:, 1:], slope.T @ weighted[:, 0]
-        matrix[:2, :2] += prior
-        pull[:2] += prior @ off
-        return _Normal(
-            a3=a3,
-            zenith=zenith,
-            across=across,
-            matrix=matrix,
-            pull=pull,
-            prior=prior,
-            chi2=float(left @ weighted[:, 0] + off @ prior @ off),
-            off=np.abs(left) / np.sqrt(np.diag(stated)),
-        )
+        off = across @ (moved(x)[0] - given.a3 @ ray)
+        return np.append(white @ left(x), prior @ off)
 
-    def descended(self, a3: np.ndarray, zenith: np.ndarray) -> "_Normal | None":
-        """The least chi-square near an A3 and a zenith, by Levenberg and Marquardt's method.
-
-        Axis and zenith together lie in a narrow, bent valley where the sensor leans about alike in all directions.
-        """
-        damping, now, ray = FIRST_DAMPING, self.at(a3, zenith), self.ray
-        axis = rotation.normalised(a3 @ ray)
-        if now is None:
-            return None
-        for _ in range(AXIS_ROUNDS):
-            damped = now.matrix + damping * np.diag(np.diag(now.matrix))
-            step = -np.linalg.solve(damped, now.pull)
-            step /= max(1.0, float(np.abs(step).max()) / MAX_STEP_RAD)
-            moved = rotation.normalised(now.a3 @ ray + step[:2] @ now.across)
-            # each from the first, because products of many turns grow apart from a rotation
-            tried_a3, there = rotation.shortest_turn(axis, moved) @ a3, now.zenith
-            if self.zenith_sigma is None:
-                there = rotation.normalised(there + step[2:] @ Directions.east_north(there))
-            tried = self.at(tried_a3, there)
-            if tried is None or tried.chi2 > now.chi2:
-                damping *= 10
-                if damping > LAST_DAMPING:
-                    break
-                continue
-            gain, now, damping = now.chi2 - tried.chi2, tried, damping / 10
-            if gain < SETTLED_CHI2:
-                break
-        return now
+    origin = np.zeros(4 if site is None else 2)
+    if residual(origin)[0] == IMPOSSIBLE:
+        return None
+    how = {"method": "trf", "loss": "soft_l1"} if robust else {"method": "lm"}
+    found = least_squares(residual, origin, x_scale="jac", xtol=SETTLED, ftol=SETTLED, **how)
+    axis, there = moved(found.x)
+    if np.linalg.matrix_rank(found.jac / np.maximum(np.linalg.norm(found.jac, axis=0), 1e-9)) < len(origin):
+        return None
+    spread = np.linalg.inv(found.jac.T @ found.jac)
+    # by the elevations rather than what was known
+    told = len(origin) - float(np.trace(np.linalg.solve(known, spread[:2, :2])))
+    chi2, number = 2 * float(found.cost), len(stated)
+    scatter2 = excess(chi2, int(number - np.floor(told + 1e-6)))
+    return FoundAxis(
+        a3=rotation.shortest_turn(start, axis) @ a3,
+        ray=ray,
+        zenith=there,
+        across=across,
+        covariance=spread[:2, :2] * (1 + scatter2),
+        scatter2=scatter2,
+        directions=number,
+        off=np.abs(left(found.x)) / sigma,
+        chi2=chi2,
+        circles=circles,
+    )
 
 
 def _seen(up: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -304,26 +286,8 @@ def _seen(up: np.ndarray, axis: np.ndarray) -> np.ndarray:
     return np.arctan2(np.linalg.norm(np.cross(up, axis), axis=1), up @ axis)
 
 
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class _Normal:
-    """The least-squares problem at an A3 (3, 3) and a zenith (3,): its unknowns are the axis, and perhaps the zenith.
-
-    off (D,): residuals in stated sigmas.
-    """
-
-    a3: np.ndarray
-    zenith: np.ndarray
-    across: np.ndarray
-    matrix: np.ndarray
-    pull: np.ndarray
-    prior: np.ndarray
-    chi2: float
-    off: np.ndarray
-
-
 def _fitted(
-    circles_of: CirclesOf, given: Calibration, ray: np.ndarray, zenith: np.ndarray, zenith_sigma: float | None
+    circles_of: CirclesOf, given: Calibration, ray: np.ndarray, zenith: np.ndarray, site: Place | None
 ) -> FoundAxis | None:
     """The answer near a zenith; None if it does not converge."""
     a3, frames, now = given.a3, 0, None
@@ -333,27 +297,10 @@ def _fitted(
         if len(circles) < frames:
             return None
         frames, before = len(circles), a3
-        problem = _Problem(a3, circles, given, ray, zenith_sigma)
-        now = problem.descended(a3, zenith)
+        now = _solved(a3, zenith, circles, given, ray, site)
         if now is None:
             return None
         a3, zenith = now.a3, now.zenith
         if np.linalg.norm((a3 - before) @ ray) < SAME_AXIS_RAD:
             break
-    assert now is not None
-    spread = np.linalg.inv(now.matrix)
-    told = len(spread) - float(np.trace(now.prior @ spread[:2, :2]))
-    number = len(problem.part.circles)
-    scatter2 = excess(now.chi2, int(number - np.floor(told + 1e-6)))
-    return FoundAxis(
-        a3=a3,
-        ray=ray,
-        zenith=zenith,
-        across=now.across,
-        covariance=spread[:2, :2] * (1 + scatter2),
-        scatter2=scatter2,
-        directions=number,
-        off=now.off,
-        chi2=now.chi2,
-        circles=circles,
-    )
+    return now

@@ -52,31 +52,23 @@ WAY_ROUNDS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class SextantSight:
-    """One altitude as it was read, rad; limb: 1 for the lower, -1 for the upper, 0 for the centre.
+    """One altitude, rad; limb: 1 for the lower, -1 for the upper, 0 for the centre.
 
-    height_of_eye_m: above the sea whose horizon is used; NaN without.  artificial: whether the altitude is twice the
-    body's, over its image in a mirror that is level.  course (rad), speed_m_s: of the way from the sight before.
+    apparent: of the limb above the horizontal, with refraction.  artificial: whether twice the body's was read, over its
+    image in a mirror that is level; by_sea: whether the sea's horizon is used.
+    course (rad), speed_m_s: of the way from the sight before.
     """
 
     source: str
     body: str
     limb: int
     utc_unix_s: float
-    altitude: float
-    index_error: float
-    height_of_eye_m: float
+    apparent: float
     artificial: bool
+    by_sea: bool
     sigma: float
     course: float
     speed_m_s: float
-
-    @property
-    def apparent(self) -> float:
-        """The altitude of the limb above the horizontal, with refraction, rad."""
-        read = self.altitude - self.index_error
-        if self.artificial:
-            return read / 2
-        return read - (0.0 if math.isnan(self.height_of_eye_m) else DIP * math.sqrt(self.height_of_eye_m))
 
 
 def read_sights(path: Path | str) -> list[SextantSight]:
@@ -121,15 +113,17 @@ def _sight(row: dict, where: str) -> SextantSight:
         utc_unix_s = unix_of(cells["utc"])
     except StarposError as error:
         raise FrameError(f"{where}: {error}") from None
+    artificial, eye_m = values["artificial_horizon"] >= 0.5, values["height_of_eye_m"]
+    by_sea = not (artificial or math.isnan(eye_m))
+    read = math.radians(values["altitude_deg"]) - values["index_error_arcmin"] * ARCMIN
     return SextantSight(
         source=where,
         body=" ".join(cells["body"].lower().split()),
         limb=LIMBS[cells["limb"].lower()],
         utc_unix_s=utc_unix_s,
-        altitude=math.radians(values["altitude_deg"]),
-        index_error=values["index_error_arcmin"] * ARCMIN,
-        height_of_eye_m=values["height_of_eye_m"],
-        artificial=values["artificial_horizon"] >= 0.5,
+        apparent=(read / 2 if artificial else read) - (DIP * math.sqrt(eye_m) if by_sea else 0.0),
+        artificial=artificial,
+        by_sea=by_sea,
         sigma=values["sigma_arcmin"] * ARCMIN,
         course=math.radians(values["course_deg"]),
         speed_m_s=values["speed_knots"] * KNOT,
@@ -164,10 +158,9 @@ def circle_of_sight(
     true = atmosphere.refraction().unbend(seen)
     altitude = math.atan2(true[2], math.hypot(true[0], true[1]))
     half = 0.5 if sight.artificial else 1.0
-    horizon = 0.0 if sight.artificial or math.isnan(sight.height_of_eye_m) else DIP_STDDEV
     errors = {
         "index": INDEX_STDDEV * half,
-        "horizon": horizon,
+        "horizon": DIP_STDDEV * sight.by_sea,
         "refraction": (altitude - apparent) * atmosphere.relative_sigma,
     }
     return Circle(

@@ -24,13 +24,12 @@ from starpos.calibration.misalignment import NOTHING_KNOWN, Known
 from starpos.earth.orientation import earth_state
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import CalibrationError, InstrumentError, TimeError
-from starpos.fix.checks import check_risen
+from starpos.errors import CalibrationError, InstrumentError
+from starpos.fix.checks import check_risen, state_at
 from starpos.fix.heading import checked_zenith, confirms_hour, feigned
 from starpos.fix.solver import ENOUGH_SOUND, high_enough
 from starpos.fix.star_fit import MatchedStars, sound_matches
 from starpos.frames.frame import Stars
-from starpos.frames.reading import why_no_time
 from starpos.frozen import at_once
 from starpos.identification import Identification, PointingPrior, Sky, field_of, fisheye, identify, triangles
 from starpos.identification.triangles import TriangleCatalogue
@@ -505,9 +504,7 @@ class _Frame:
     ) -> "_Frame":
         local = None
         if site is not None and level is None:
-            if stars.mid_unix_s is None:
-                raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
-            local = site.plumb_axes @ earth_state(stars.mid_unix_s).gcrs_to_itrs
+            local = site.plumb_axes @ state_at(stars).gcrs_to_itrs
         return cls(stars.select(stars.on_frame), level, Sky.at(catalogue, table, stars.mid_unix_s), local)
 
     def of_sky(self, attitude: np.ndarray) -> np.ndarray:
@@ -545,11 +542,6 @@ class _Frame:
         # others were checked when they became known
         if attitude is None:
             self.check_risen(stars, found, camera)
-        return self._sighting(stars, seen, found, camera)
-
-    def _sighting(
-        self, stars: Stars, seen: np.ndarray, found: Identification, camera: Camera
-    ) -> CameraSighting:
         use = sound_matches(stars, found, ENOUGH_SOUND)
         level = self._level(found.attitude)
         if level is not None and fisheye.is_wide(camera):

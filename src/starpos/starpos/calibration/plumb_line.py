@@ -2,7 +2,7 @@
 """The plumb line in the camera: A3 from the attitudes of frames and their tilts, with a known or an unknown zenith."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 
@@ -13,12 +13,12 @@ from starpos.averaging.poses import poses_of
 from starpos.averaging.scatter import Frames, Scatter, scatter_of
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.errors import FixError
-from starpos.fix.fix import Fix
-from starpos.fix.terms import EACH_POSE, ErrorTerm
+from starpos.fix.fix import Fix, zenith_variance
+from starpos.fix.terms import EACH_POSE
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import UNKNOWN_ARCSEC
-from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, response_columns, stated_variances
+from starpos.instrument.mounting import response_columns, stated_variances
 from starpos.units import ARCSEC, MEDIAN_OF_CHI2
 
 # sigma of a coefficient that is as good as known
@@ -34,53 +34,53 @@ LEAN_SIGMA = 5.0
 class Readings:
     """Attitudes and tilts of K frames.
 
-    utc_unix_s (K,).  to_camera (K, 3, 3): ITRS into C.  plumb (K, 3): up in S as the inclinometer reads it.  heading
-    (K,) in rad. sigma (K,) in rad: of the zenith from each frame alone.
+    utc_unix_s (K,).  to_camera (K, 3, 3): ITRS into C.  plumb (K, 3): up in S as the inclinometer reads it.
+    sigma (K,) in rad: of the zenith from each frame alone.
     common2 (K,) in rad2: variance of what moves the zenith of all frames about alike.
     pose (K,): number of each frame's pose, from 0.  pose_sigma (rad): of an error that is new at each pose.
     columns (K, 3, M): change of `plumb` for each of M errors of the inclinometer that frames share: its drift and its
     temperature in units of their sigma, then its response.  column_sigma (M,): 1 sigma of these.
+    axes: of the inclinometer.
     """
 
     utc_unix_s: np.ndarray
     to_camera: np.ndarray
     plumb: np.ndarray
-    heading: np.ndarray
     sigma: np.ndarray
     common2: np.ndarray
     pose: np.ndarray
     pose_sigma: float
     columns: np.ndarray
     column_sigma: np.ndarray
+    axes: int
 
     @classmethod
     def of(cls, fixes: Sequence[Fix], errors: InclinometerErrors) -> "Readings":
         """Readings of frames with a fix; FixError if some have two axes and some three."""
         tilts = [f.tilt for f in fixes]
         plumb = np.array([t.up for t in tilts])
-        axes = {t.axes for t in tilts}
-        if len(axes) != 1:
+        if len({t.axes for t in tilts}) != 1:
             raise FixError("some tilts have two axes and some three: give the tilts of one inclinometer")
         mean = rotation.normalised(plumb.sum(0))
         response = np.array([response_columns(t.theta, t.up, mean) for t in tilts])
         walked = _wandering(fixes, errors)
-        variances = stated_variances(errors, axes.pop())
+        variances = stated_variances(errors, tilts[0].axes)
         return cls(
             utc_unix_s=np.array([f.utc_unix_s for f in fixes]),
             to_camera=np.array([f.camera.rotation.T for f in fixes]),
             plumb=plumb,
-            heading=np.array([f.heading for f in fixes]),
             sigma=_own_sigma(fixes),
-            common2=np.array([_variance(t for t in f.terms if t.name in OF_PLACE) for f in fixes]),
+            common2=np.array([zenith_variance(t for t in f.terms if t.name in OF_PLACE) for f in fixes]),
             pose=poses_of(fixes),
             pose_sigma=errors.pose_rad,
             columns=np.concatenate([walked, response], 2),
             column_sigma=np.concatenate([np.ones(walked.shape[2]), np.maximum(np.sqrt(variances), KNOWN)]),
+            axes=tilts[0].axes,
         )
 
     def subset(self, rows: np.ndarray) -> "Readings":
         """The readings of the frames in `rows`."""
-        per_frame = ("utc_unix_s", "to_camera", "plumb", "heading", "sigma", "common2", "columns")
+        per_frame = ("utc_unix_s", "to_camera", "plumb", "sigma", "common2", "columns")
         pose = np.unique(self.pose[rows], return_inverse=True)[1]
         return replace(self, pose=pose, **{name: getattr(self, name)[rows] for name in per_frame})
 
@@ -101,20 +101,8 @@ class Readings:
 
     @property
     def response(self) -> slice:
-        """The columns of the response."""
-        return slice(self.columns.shape[2] - RESPONSE_COEFFICIENTS[self._axes], self.columns.shape[2])
-
-    @property
-    def _axes(self) -> int:
-        # drift and temperature have a column an axis
-        return {2 * axes + number: axes for axes, number in RESPONSE_COEFFICIENTS.items()}[
-            self.columns.shape[2]
-        ]
-
-
-def _variance(terms: Iterable[ErrorTerm]) -> float:
-    """Variance per axis in rad2 of the zenith, by terms of a fix."""
-    return float(sum(np.trace(t.covariance[:2, :2]) for t in terms)) / 2 / EARTH_RADIUS_M**2
+        """The columns of the response: those after the drift and the temperature of each axis."""
+        return slice(2 * self.axes, self.columns.shape[2])
 
 
 def _own_sigma(fixes: Sequence[Fix]) -> np.ndarray:
@@ -211,12 +199,11 @@ def symmetric(covariance: np.ndarray) -> np.ndarray:
 @at_once
 @dataclass(frozen=True)
 class _State:
-    """Where T fits stand: a3 (T, 3, 3), up (T, 3) of any length, p (T, n) as in PlumbLine, start (T,): its number."""
+    """Where T fits stand: a3 (T, 3, 3), up (T, 3) of any length, p (T, n) as in PlumbLine."""
 
     a3: np.ndarray
     up: np.ndarray
     p: np.ndarray
-    start: np.ndarray
 
 
 def fits(
@@ -233,9 +220,30 @@ def fits(
     zenith (3,): None if nothing is known of it.  The residuals compare the readings with the plumb line of the stars,
     whose error is small compared with theirs.  The prior of A3's tilts is UNKNOWN_ARCSEC.
     """
-    return _Fits(readings, starts, turn_sigma, turned, zenith, zenith_sigma).found()
+    to_camera, mean = readings.to_camera, readings.mean_plumb
+    if zenith is None:
+        zenith = np.einsum("kji,tlj,kl->ti", to_camera, starts, readings.plumb)
+    zenith = rotation.normalised(np.broadcast_to(zenith, (len(starts), 3)))
+    across = np.linalg.svd(zenith[:, None])[2][:, 1:]
+    turns = np.vstack([np.linalg.svd(mean[None])[2][1:], mean]).T
+    loose = UNKNOWN_ARCSEC[0] * ARCSEC
+    sigma = [loose, loose, turn_sigma, zenith_sigma, zenith_sigma, *readings.column_sigma]
+    problem = _Fits(
+        readings=readings,
+        turns=turns,
+        columns=-np.einsum("kim,ij->kjm", readings.columns, turns[:, :2]),
+        prior_sigma=np.array(sigma),
+        zenith=zenith,
+        across=across,
+        seen_across=np.einsum("kij,tdj->tdki", to_camera, across),
+    )
+    p = np.zeros((len(starts), len(sigma)))
+    p[:, 2] = turned
+    return problem.found(_State(starts, zenith, p))
 
 
+@at_once
+@dataclass(frozen=True, kw_only=True)
 class _Fits:
     """What all starts of a fit share, and what each begins with.
 
@@ -244,46 +252,30 @@ class _Fits:
     zenith (T, 3), across (T, 2, 3): of each start, in ITRS.  seen_across (T, 2, K, 3): `across` in the camera.
     """
 
-    def __init__(
-        self,
-        readings: Readings,
-        starts: np.ndarray,
-        turn_sigma: float,
-        turned: np.ndarray | float,
-        known: np.ndarray | None,
-        zenith_sigma: float,
-    ) -> None:
-        to_camera, mean = readings.to_camera, readings.mean_plumb
-        if known is None:
-            zenith = np.einsum("kji,tlj,kl->ti", to_camera, starts, readings.plumb)
-        else:
-            zenith = np.tile(known, (len(starts), 1))
-        loose = UNKNOWN_ARCSEC[0] * ARCSEC
-        sigma = [loose, loose, turn_sigma, zenith_sigma, zenith_sigma, *readings.column_sigma]
-        self.readings, self.spread, self.prior_sigma = readings, readings.spread, np.array(sigma)
-        self.turns = np.vstack([np.linalg.svd(mean[None])[2][1:], mean]).T
-        self.columns = -np.einsum("kim,ij->kjm", readings.columns, self.turns[:, :2])
-        self.zenith = rotation.normalised(zenith)
-        self.across = np.linalg.svd(self.zenith[:, None])[2][:, 1:]
-        self.seen_across = np.einsum("kij,tdj->tdki", to_camera, self.across)
-        p = np.zeros((len(starts), len(sigma)))
-        p[:, 2] = turned
-        self.begin = _State(starts, self.zenith, p, np.arange(len(starts)))
+    readings: Readings
+    turns: np.ndarray
+    columns: np.ndarray
+    prior_sigma: np.ndarray
+    zenith: np.ndarray
+    across: np.ndarray
+    seen_across: np.ndarray
 
-    def found(self) -> list[PlumbLine]:
+    def found(self, now: _State) -> list[PlumbLine]:
         """The answer from each start."""
-        now = self.begin
-        best = np.full(len(now.start), np.inf)
-        answer = _State(now.a3.copy(), now.up.copy(), now.p.copy(), now.start)
+        best, answer = np.full(len(now.p), np.inf), now
         for _ in range(MAX_STEPS):
             _, slope, off, cost = self._slopes(now)
             # if the headings hardly differ, later steps may lead away again
-            better = cost < best[now.start]
-            rows = now.start[better]
-            best[rows] = cost[better]
-            answer.a3[rows], answer.up[rows], answer.p[rows] = now.a3[better], now.up[better], now.p[better]
-            now = self._stepped(now, slope, off)
-            if not len(now.start):
+            better = cost < best
+            best = np.where(better, cost, best)
+            answer = _State(
+                *(
+                    np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+                    for a, b in ((now.a3, answer.a3), (now.up, answer.up), (now.p, answer.p))
+                )
+            )
+            now, gain = self._stepped(now, slope, off)
+            if (gain < SETTLED_CHI2).all():
                 break
         residual, slope, off, cost = self._slopes(answer)
         scaled = self._design(slope, off)[0]
@@ -297,7 +289,7 @@ class _Fits:
         with them in sigma, and the costs (T,).
         """
         plumb, flat = self.readings.plumb, self.turns[:, :2]
-        count, frames, n = len(now.start), len(plumb), len(self.prior_sigma)
+        count, frames, n = len(now.p), len(plumb), len(self.prior_sigma)
         length = np.linalg.norm(now.up, axis=1)
         seen = np.tensordot(now.up / length[:, None], self.readings.to_camera, (1, 2))
         read = seen @ now.a3.swapaxes(1, 2)
@@ -305,12 +297,12 @@ class _Fits:
         slope = np.empty((count, frames, 2, n))
         # a turn about an axis moves the reading by axis x reading
         slope[..., :3] = np.tensordot(read, np.cross(self.turns.T, flat.T[:, None]), (2, 2))
-        moved = self.seen_across[now.start].reshape(count, 2 * frames, 3) @ (now.a3.swapaxes(1, 2) @ flat)
+        moved = self.seen_across.reshape(count, 2 * frames, 3) @ (now.a3.swapaxes(1, 2) @ flat)
         slope[..., 3:5] = (
             -moved.reshape(count, 2, frames, 2).transpose(0, 2, 3, 1) / length[:, None, None, None]
         )
         slope[..., 5:] = self.columns
-        off = (residual + np.tensordot(now.p[:, 5:], self.columns, (1, 2))) / self.spread[:, None]
+        off = (residual + np.tensordot(now.p[:, 5:], self.columns, (1, 2))) / self.readings.spread[:, None]
         prior = np.sum((now.p / self.prior_sigma) ** 2, axis=1)
         return residual, slope, off, (robust(off).sum((1, 2)) + prior) / 2
 
@@ -320,10 +312,10 @@ class _Fits:
         weight = huber(off)
         # the prior's own units keep the loose and the tight of one size
         scaled = slope.reshape(*off.shape, -1) * self.prior_sigma
-        return scaled * (weight / np.repeat(self.spread, 2))[..., None], off * weight
+        return scaled * (weight / np.repeat(self.readings.spread, 2))[..., None], off * weight
 
-    def _stepped(self, now: _State, slope: np.ndarray, off: np.ndarray) -> _State:
-        """The fits after a Gauss-Newton step of at most LONGEST_STEP, without those that have settled."""
+    def _stepped(self, now: _State, slope: np.ndarray, off: np.ndarray) -> tuple[_State, np.ndarray]:
+        """The fits after a step of at most LONGEST_STEP, and by how much a whole one would lower each chi-square."""
         design, weighted = self._design(slope, off)
         transposed = design.swapaxes(1, 2)
         pull = (transposed @ weighted[..., None])[..., 0] + now.p / self.prior_sigma
@@ -332,12 +324,10 @@ class _Fits:
         step = -self.prior_sigma * moved
         longest = np.linalg.norm(step[:, :5], axis=1, keepdims=True)
         step *= LONGEST_STEP / np.maximum(longest, LONGEST_STEP)
-        # by how much a whole one would lower chi-square
-        go = np.sum(moved * pull, axis=1) >= SETTLED_CHI2
-        step, p, start = step[go], now.p[go] + step[go], now.start[go]
-        turned = np.array([rotation.from_vector(self.turns @ s) for s in step[:, :3]]).reshape(-1, 3, 3)
-        up = self.zenith[start] + np.einsum("td,tdi->ti", p[:, 3:5], self.across[start])
-        return _State(turned @ now.a3[go], up, p, start)
+        p = now.p + step
+        turned = np.array([rotation.from_vector(self.turns @ s) for s in step[:, :3]])
+        up = self.zenith + np.einsum("td,tdi->ti", p[:, 3:5], self.across)
+        return _State(turned @ now.a3, up, p), np.sum(moved * pull, axis=1)
 
     def _plumb_line(
         self, answer: _State, t: int, residual: np.ndarray, slope: np.ndarray, scaled: np.ndarray, cost: float
@@ -358,7 +348,7 @@ class _Fits:
             zenith=rotation.normalised(answer.up[t]),
             zenith_sigma=float(np.sqrt(np.linalg.eigvalsh(given_turn[2:4, 2:4])[-1])),
             cost=cost,
-            scatter=2 * cost / max(2 * len(self.spread) - 5, 1),
+            scatter=2 * cost / max(2 * len(readings.plumb) - 5, 1),
             left=residual + self.columns @ p[5:],
             response=p[response],
             response_covariance=symmetric(whole[response, response]),
@@ -370,16 +360,11 @@ class _Fits:
         )
 
 
-ROBUST_ROUNDS = 10
 TURNS_TRIED = 8
 # one pose does not show the inclinometer's response
 MIN_POSES = 2
-# chi-square per degree of freedom above which the search ended in a wrong minimum
-FOUND_SCATTER = 16.0
 # chi-square per degree of freedom above which the poses scatter
 USUAL_SCATTER = 4.0
-# the instrument leans if chi-square falls by this when the tilts may follow the heading
-LEAN_CHI2 = 25.0
 # zeniths of equally good solutions that are further apart are two answers
 AMBIGUOUS_SIGMA = 4.0
 # root mean square, per axis, of the way a random turn moves a point on a circle, in radii
@@ -405,10 +390,6 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
     """
     mean = readings.mean_plumb
     start = _axis_of_turn(readings, given)
-    [nearest] = fits(readings, start[None], turn_sigma)
-    leans = _leans(readings)
-    if nearest.scatter < FOUND_SCATTER and not leans:
-        return nearest
     # the prior holds each answer near its own start
     starts = _turns(mean, start)[1] if turn_sigma > NARROW_TURN else start[None]
     found = fits(readings, starts, turn_sigma)
@@ -417,10 +398,11 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
         # whichever way the inclinometer faces, its poses scatter
         readings = replace(readings, pose_sigma=_pose_scatter(best, readings))
         found = fits(readings, starts, turn_sigma)
-        best, nearest, leans = min(found, key=attrgetter("cost")), found[0], _leans(readings)
+        best = min(found, key=attrgetter("cost"))
     # a search that began half a turn away may have ended in a wrong minimum
-    if not leans:
-        return best if best.cost < nearest.cost - AS_GOOD else nearest
+    nearest = found[0] if found[0].cost < best.cost + AS_GOOD else best
+    if not readings.lean(_pose_scatter(nearest, readings)):
+        return nearest
     as_good = [f.zenith for f in found if f.cost < best.cost + AS_GOOD]
     apart = max(np.linalg.norm(z - best.zenith) for z in as_good)
     lean = np.arccos(np.clip(readings.plumb @ mean, -1, 1)).max()
@@ -433,11 +415,9 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
             f"leave out a frame whose tilt is wrong, level it better, or add a frame "
             "with one foot raised by as much or more"
         )
-    if nearest.cost < best.cost + AS_GOOD:
-        best = nearest
     # leans in other directions may have shown the turn
     told = turn < min(turn_sigma / 2, TOLD_TURN)
-    return best if told or astray < best.zenith_sigma / 2 else replace(best, astray=astray)
+    return nearest if told or astray < nearest.zenith_sigma / 2 else replace(nearest, astray=astray)
 
 
 def hang(
@@ -453,9 +433,7 @@ def hang(
     angles, starts = _turns(mean, start) if turn_sigma > NARROW_TURN else (np.zeros(1), start[None])
     found = fits(readings, starts, turn_sigma, angles, zenith, min(max(zenith_sigma, 1e-12), np.pi))
     best = min(found, key=attrgetter("cost"))
-    if found[0].cost < best.cost + AS_GOOD:
-        best = found[0]
-    return best
+    return found[0] if found[0].cost < best.cost + AS_GOOD else best
 
 
 def typical(left: np.ndarray, parameters: int) -> float:
@@ -523,35 +501,6 @@ def _turns(axis: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Angles (T,) in rad about an axis of S, and A3s (T, 3, 3) that start from `start` (3, 3) turned by each."""
     angles = np.array([rotation.half_turn(k * 2 * np.pi / TURNS_TRIED) for k in range(TURNS_TRIED)])
     return angles, np.array([rotation.from_vector(axis * angle) for angle in angles]) @ start
-
-
-def _leans(readings: Readings) -> bool:
-    """Whether the plumb line in S moves with the heading by more than noise and wandering explain."""
-    heading, one = readings.heading, np.ones(len(readings.heading))
-    still, going = (
-        _chi2_without(readings, np.stack(c, -1)) for c in ((one,), (one, np.cos(heading), np.sin(heading)))
-    )
-    return still - going > LEAN_CHI2
-
-
-def _chi2_without(readings: Readings, columns: np.ndarray) -> float:
-    """Robust chi-square of the plumb line after a fit of columns (K, n) for each axis of S.
-
-    Robust, because one reading that is far off is no lean.
-    """
-    weight, more = 1 / readings.spread, readings.columns.shape[2]
-    wandering = (readings.columns * readings.column_sigma).reshape(-1, more)
-    off = np.append(((readings.plumb - readings.mean_plumb) * weight[:, None]).ravel(), np.zeros(more))
-    design = np.hstack([np.kron(columns, np.eye(3)), wandering])
-    design = np.vstack(
-        [design * np.repeat(weight, 3)[:, None], np.eye(more, design.shape[1], design.shape[1] - more)]
-    )
-    pull: np.ndarray = np.ones(len(off))
-    for _ in range(ROBUST_ROUNDS):
-        rest = off - design @ np.linalg.lstsq(design * pull[:, None], off * pull, rcond=1e-9)[0]
-        size = np.linalg.norm(rest[: len(rest) - more].reshape(-1, 3), axis=1)
-        pull = np.append(np.repeat(huber(size), 3), np.ones(more))
-    return float(robust(size).sum() + np.sum(rest[len(rest) - more :] ** 2))
 
 
 def _axis_of_turn(readings: Readings, given: np.ndarray) -> np.ndarray:

@@ -25,8 +25,6 @@ class Attitude:
     rotation (3, 3): takes components along the axes of the frame `of` to components along the axes of `into`.
     covariance (3, 3): rad2, of its small rotation about the axes of `into`.
     terms: the budget of which `covariance` is the sum; () without one.
-    by_refraction (3,): small rotation (rad) about the axes of `into` if refraction is stronger by its own size;
-    None where that was not asked.
     """
 
     rotation: np.ndarray
@@ -35,14 +33,10 @@ class Attitude:
     of: str
     into: str
     terms: tuple[ErrorTerm, ...] = ()
-    by_refraction: np.ndarray | None = None
 
     def then(self, turn: np.ndarray, into: str) -> "Attitude":
         """The attitude in another frame, without its budget; turn (3, 3): from the axes of `into` to the new ones."""
-        bent = None if self.by_refraction is None else turn @ self.by_refraction
-        return Attitude(
-            turn @ self.rotation, turn @ self.covariance @ turn.T, of=self.of, into=into, by_refraction=bent
-        )
+        return Attitude(turn @ self.rotation, turn @ self.covariance @ turn.T, of=self.of, into=into)
 
     @property
     def unshared(self) -> np.ndarray:

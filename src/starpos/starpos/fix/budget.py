@@ -95,16 +95,6 @@ def link_attitude(link_to_enu: np.ndarray, terms: tuple[ErrorTerm, ...]) -> Atti
     return Attitude(link_to_enu, total_covariance(terms)[3:, 3:], of=LINK, into=ENU, terms=terms)
 
 
-def lens_term(sky: np.ndarray, camera: np.ndarray, mounting: Mounting) -> tuple[ErrorTerm, ...]:
-    """The error of directions in C by an unknown lens, new at each pose; empty for a known one.
-
-    sky (r, 3): an ErrorTerm's rows for a small rotation of the sky about L's axes.  camera (3, 3): C into L.
-    """
-    if not mounting.lens_stddev_rad:
-        return ()
-    return (ErrorTerm("lens", sky @ camera[:, :2] * mounting.lens_stddev_rad, shared=EACH_POSE),)
-
-
 def mount_term(name: str, link_to_enu: np.ndarray, stddev: float) -> tuple[ErrorTerm, ...]:
     """The error of the base link against the sky that the camera sees, stddev rad about each axis; empty if that is 0."""
     if not stddev:

@@ -9,14 +9,15 @@ from collections.abc import Iterable
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.ellipsoid import EARTH_RADIUS_M
-from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.earth.orientation import ROTATION_RAD_S, EarthState, earth_state
 from starpos.earth.refraction import MIN_COS_ZENITH
-from starpos.errors import FixError, PlaceError
+from starpos.errors import FixError, PlaceError, TimeError
 from starpos.fix.budget import CALIBRATION
-from starpos.fix.fix import Fix, angle_text
+from starpos.fix.fix import Fix, angle_text, zenith_variance
 from starpos.fix.terms import ErrorTerm
 from starpos.frames.frame import SATURATED, Stars
+from starpos.frames.reading import why_no_time
+from starpos.frames.tables import Pointing
 from starpos.identification import MIN_STARS, Identification, Sky, fisheye
 from starpos.identification._frame import mean_sigma
 from starpos.instrument.camera import Camera
@@ -28,6 +29,13 @@ from starpos.units import ARCSEC, HOUR_S, utc_text
 
 # Lowest altitude with a known refraction.
 MIN_DEG = np.degrees(np.arcsin(MIN_COS_ZENITH))
+
+
+def state_at(frame: Stars | Pointing) -> EarthState:
+    """The state of the Earth at a frame; TimeError if its time is not known, or cannot be used."""
+    if frame.mid_unix_s is None:
+        raise TimeError(f"{frame.place}: no time of exposure: {why_no_time(frame)}")
+    return earth_state(frame.mid_unix_s)
 
 
 def check_above_horizon(sine: float, calibration: Calibration) -> None:
@@ -203,9 +211,7 @@ def check_unmoved(fix: Fix, instrument: Instrument) -> None:
     since_s = abs(fix.utc_unix_s - instrument.calibration.utc_unix_s)
     sag2 = instrument.inclinometer.drift_rad_per_sqrt_hour**2 * since_s / HOUR_S
     # the air bends the whole field by about as much as it moves the zenith, then and now
-    air2 = (
-        sum(np.trace(t.covariance[:2, :2]) for t in fix.terms if t.name == "refraction") / EARTH_RADIUS_M**2
-    )
+    air2 = 2 * zenith_variance(t for t in fix.terms if t.name == "refraction")
     covariance = fix.camera.covariance + np.asarray(vertical.covariance_arcsec2) * ARCSEC**2
     covariance = covariance + np.eye(3) * (sag2 + air2)
     covariance[2, 2] += 2 * (ROTATION_RAD_S * fix.clock_stddev_s) ** 2

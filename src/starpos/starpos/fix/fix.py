@@ -13,12 +13,11 @@ import numpy as np
 
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
-from starpos.earth.ellipsoid import curvature_radii_m, enu_axes
+from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m, enu_axes
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of
 from starpos.fix.budget import (
     Circumstances,
-    lens_term,
     level_rows,
     link_attitude,
     local_north,
@@ -29,7 +28,7 @@ from starpos.fix.budget import (
 )
 from starpos.fix.sighting import FittedSighting, fitted_fields
 from starpos.fix.star_fit import MatchedStars, apparent, fit_stars
-from starpos.fix.terms import ErrorTerm, Origin, total_covariance
+from starpos.fix.terms import EACH_POSE, ErrorTerm, Origin, total_covariance
 from starpos.frames.tables import Pointing
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
@@ -50,6 +49,11 @@ def angle_text(rad: float) -> str:
     """An angle in arcsec, or from 1 deg in deg."""
     arcsec = rad / ARCSEC
     return f"{arcsec:.0f} arcsec" if arcsec < 3600 else f"{arcsec / 3600:.2f} deg"
+
+
+def zenith_variance(terms: Iterable[ErrorTerm]) -> float:
+    """Variance per axis in rad2 of the zenith, by terms of a fix."""
+    return float(sum(np.trace(t.covariance[:2, :2]) for t in terms)) / 2 / EARTH_RADIUS_M**2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,9 +218,12 @@ def levelled_fix(
     of_sky, of_level = sky_rows(place), level_rows(place, link_to_enu)
     # the two axes go with the inclinometer, however it leans
     axes = rotation.shortest_turn(np.array([0.0, 0.0, 1.0]), level.up)[:, :2]
+    own, other, *rest = terms_of(of_sky)
     terms = (
-        *terms_of(of_sky),
+        own,
+        other,
         *tilt_terms(of_level, level, tilt, mounting, about.earth.utc_unix_s),
+        *rest,
         *sky_terms(of_sky, about.earth, about.clock_stddev_s, about.stamp_stddev_s, a4),
         *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
     )
@@ -239,7 +246,10 @@ def solve_fix(stars: MatchedStars, tilt: Tilt, about: Circumstances) -> Fix:
     seen = fit_stars(stars, about.camera, g, about.atmosphere.refraction(), apparent(stars, about))
 
     def terms_of(rows: np.ndarray) -> tuple[ErrorTerm, ...]:
-        return *seen.terms(rows, about), *lens_term(rows, g, about.mounting)
+        if not (stddev := about.mounting.lens_stddev_rad):
+            return seen.terms(rows, about)
+        # what is not known of the lens moves directions in C, newly at each pose
+        return *seen.terms(rows, about), ErrorTerm("lens", rows @ g[:, :2] * stddev, shared=EACH_POSE)
 
     a4 = seen.fit.a4
     return levelled_fix(fitted_fields(seen, about, g, a4), a4, level, tilt, about, terms_of)

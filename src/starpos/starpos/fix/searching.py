@@ -133,9 +133,8 @@ def _by_stars(solver: Solver, question: Question) -> Sight:
 
 def identify_every_way(solver: Solver, question: Question) -> Sight:
     """Identify a frame; its stars that identified it, or the given ones with the first answer if none did."""
-    first = Sight(question.stars, solver.identify(question.stars, question.predicted))
-    # most frames are: what all other ways need is not made for them
-    return _otherwise(solver, question, first) if first.solution.lost else first
+    first = solver.identify(question.stars, question.predicted)
+    return _otherwise(solver, question, Sight(question.stars, first))
 
 
 def identify_blind_every_way(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> Sight:
@@ -171,13 +170,11 @@ def _otherwise(solver: Solver, q: Question, first: Sight) -> Sight:
 def _ways(solver: Solver, q: Question, seen: Stars) -> Iterator[Solution]:
     """Yield the answers to these stars of a frame, by one way after another; its own were searched already."""
     look = look_at(q.item, seen)
-    if seen is not q.stars:
-        yield solver.identify(seen, q.predicted)
-    if look is not None:
-        yield solver.look_again(seen, look, q.predicted)
-    yield solver.identify(seen, q.predicted, part=PART)
-    if look is not None:
-        yield solver.look_again(seen, look, q.predicted, part=PART)
+    for part in (1.0, PART):
+        if seen is not q.stars or part != 1.0:
+            yield solver.identify(seen, q.predicted, part)
+        if look is not None:
+            yield solver.identify(seen, q.predicted, part, look)
 
 
 def focal_px_that_fits(solver: Solver, stars: Stars) -> float | None:

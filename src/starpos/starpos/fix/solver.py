@@ -11,7 +11,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.earth.orientation import ROTATION_RAD_S, EarthState, earth_state
+from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import (
@@ -21,7 +21,6 @@ from starpos.errors import (
     PlaceError,
     StarposError,
     TiltError,
-    TimeError,
 )
 from starpos.fix.budget import Circumstances
 from starpos.fix.checks import (
@@ -31,6 +30,7 @@ from starpos.fix.checks import (
     check_trails,
     check_unmoved,
     set_stars,
+    state_at,
     why_unidentified,
 )
 from starpos.fix.fix import IDEAL, Fix, length_text, pointing_fix, solve_fix
@@ -39,7 +39,6 @@ from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Solution, Status, solut
 from starpos.fix.star_fit import MatchedStars, sound_matches
 from starpos.frames.exposure import GLOBAL_SHUTTER, UNKNOWN_SHUTTER, Shutter
 from starpos.frames.frame import EDGE_PX, Stars
-from starpos.frames.reading import why_no_time
 from starpos.frames.tables import Pointing
 from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, field_of, fisheye, identify
 from starpos.identification._frame import FrameStars, all_within, ideal_frame, mean_sigma, unit_vectors
@@ -103,9 +102,6 @@ def _aims(stars: Stars, field: FrameStars | fisheye.WideField) -> tuple[AimPrior
     return (AimPrior(rotation.unit_vector(ra, dec)),)
 
 
-# how stars are identified: the field, the sky, the camera
-_Search = Callable[[FrameStars | fisheye.WideField, Sky, Camera], Identification | None]
-
 HourByLens = Callable[[Stars, Identification, Camera, Catalogue, Atmosphere, Place], bool]
 
 ENOUGH_SOUND = 8
@@ -149,32 +145,15 @@ class Solver:
         Sky(catalogue, triangles).load()
         return deeper.too_thin(catalogue, camera)
 
-    def identify(self, stars: Stars, predicted: Priors = (), part: float = 1.0) -> Solution:
+    def identify(
+        self, stars: Stars, predicted: Priors = (), part: float = 1.0, look: Look | None = None
+    ) -> Solution:
         """Names of the stars and pointing of the camera, near a prediction or anywhere.
 
         Stars without a time have J2000 places.
         part: of the frame in which its stars lie, as a share of its size: triangles that are looked up are no larger.
+        look: shows where the frame of stars that alone are too few has others; a fisheye's stays unidentified then.
         """
-        return self._identified(
-            stars, part, lambda field, sky, _: identify(field, sky, (*predicted, *_aims(stars, field)))
-        )
-
-    def look_again(self, stars: Stars, look: Look, predicted: Priors = (), part: float = 1.0) -> Solution:
-        """Identify stars that alone are too few, by what their frame shows where others should be.
-
-        Only for a frame on which `identify` has failed; a fisheye's stays unidentified.
-        """
-
-        def by_looking(
-            field: FrameStars | fisheye.WideField, sky: Sky, camera: Camera
-        ) -> Identification | None:
-            if isinstance(field, FrameStars):
-                return second_look(field, sky, (*predicted, *_aims(stars, field)), camera, look)
-            return None
-
-        return self._identified(stars, part, by_looking)
-
-    def _identified(self, stars: Stars, part: float, search: _Search) -> Solution:
         begin = time.perf_counter()
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
@@ -184,11 +163,15 @@ class Solver:
             field: FrameStars | fisheye.WideField | None = as_seen(camera, stars)
             if field is None:
                 if (rows := inside(stars, camera)) is not None:
-                    return self._identified(stars.select(rows), part, search).among(stars, rows)
+                    return self.identify(stars.select(rows), predicted, part, look).among(stars, rows)
                 field = field_of(
                     directions_of(camera, stars), mean_sigma(stars.covariance), camera, stars.window
                 )
-            found = search(field, sky, camera)
+            priors, found = (*predicted, *_aims(stars, field)), None
+            if look is None:
+                found = identify(field, sky, priors)
+            elif isinstance(field, FrameStars):
+                found = second_look(field, sky, priors, camera, look)
         except StarposError as e:
             return Solution.refused(stars, e)
         if found is None:
@@ -275,9 +258,7 @@ class Solver:
 
     def levelled(self, frame: Stars | Pointing, tilts: Tilts) -> tuple[EarthState, Tilt]:
         """State of the Earth and the tilt at a frame; StarposError if its time or the tilt cannot be used."""
-        if frame.mid_unix_s is None:
-            raise TimeError(f"{frame.place}: no time of exposure: {why_no_time(frame)}")
-        state = earth_state(frame.mid_unix_s)
+        state = state_at(frame)
         if self.instrument.vertical is not None:
             tilts = OWN_LEVEL
         own = tilts if isinstance(tilts, ByGravity) else None
@@ -285,12 +266,12 @@ class Solver:
             tilts = own.of(frame, self.instrument)
         # the width of a uniform distribution with this standard deviation, as rounding causes
         spread_s = math.sqrt(12) * frame.stamp_stddev_s
-        tilt = tilts.average(frame.mid_unix_s, frame.exposure_s or 0.0, spread_s)
+        tilt = tilts.average(state.utc_unix_s, frame.exposure_s or 0.0, spread_s)
         if tilt.either_way:
             tilt = self._upright(tilt, frame)
         if own is not None:
             own.check_held(frame, tilt)
-        self.instrument.calibration.check_age(frame.mid_unix_s)
+        self.instrument.calibration.check_age(state.utc_unix_s)
         self.instrument.inclinometer.check_live(tilt)
         self.instrument.inclinometer.check_range(tilt)
         self.instrument.inclinometer.check_axes(tilt)
@@ -348,9 +329,7 @@ class Solver:
 
         Raises StarposError if the stars, the place or the time do not determine them.
         """
-        if stars.mid_unix_s is None:
-            raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
-        state = earth_state(stars.mid_unix_s)
+        state = state_at(stars)
         camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
         up = found.attitude @ state.gcrs_to_itrs.T @ place.plumb_axes[2]
         sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))

@@ -273,14 +273,6 @@ class StarFit:
             ErrorTerm("shutter", rolling, shared=ALWAYS, constant_within_pose=True),
         )
 
-    def refraction_seen(self, atmosphere: Atmosphere) -> tuple[float, float]:
-        """Share of the refraction that the field shows, relative to the air at the fitted zenith, and its 1 sigma.
-
-        An attitude and a plate scale absorb most of it; the rest compresses the field along the vertical.
-        """
-        found, covariance = self.more(np.zeros((len(self.residual), 2, 0)), atmosphere)
-        return 1 + float(found[0]), float(np.sqrt(covariance[0, 0]))
-
     def more(self, moved: np.ndarray, atmosphere: Atmosphere) -> tuple[np.ndarray, np.ndarray]:
         """Refraction beyond the air's, relative, and k more values, which move the M stars by moved (M, 2, k) px a unit.
 

@@ -50,12 +50,7 @@ def message_to_stars(message: Any, source: str = "stars") -> Stars:
 def _message_to_disc(star: Any, source: str) -> Disc:
     """The disc that a star with the flag DISC stands for; FrameError if a value is impossible."""
     covariance = np.array(star.covariance, float).reshape(2, 2)
-    if not (
-        np.isfinite([star.x, star.y, star.flux, *covariance.flat]).all()
-        and star.flux > 0
-        and np.allclose(covariance, covariance.T)
-        and np.linalg.eigvalsh(covariance)[0] > 0
-    ):
+    if not (_is_possible(covariance, star.x, star.y, star.flux) and star.flux > 0):
         raise FrameError(f"{source}: the disc's place, area or covariance is impossible: measure it again.")
     return Disc(
         x=star.x,
@@ -63,6 +58,15 @@ def _message_to_disc(star: Any, source: str) -> Disc:
         covariance=covariance,
         radius_px=float(np.sqrt(star.flux / np.pi)),
         sharp=not star.flags & SATURATED,
+    )
+
+
+def _is_possible(covariance: np.ndarray, *values: float) -> bool:
+    """Whether values are finite, and a matrix is a covariance."""
+    return bool(
+        np.isfinite([*values, *covariance.flat]).all()
+        and np.allclose(covariance, covariance.T)
+        and np.linalg.eigvalsh(covariance)[0] > 0
     )
 
 
@@ -88,12 +92,7 @@ def message_to_trails(message: Any) -> list[FrameTrail]:
     trails = []
     for t in message.trails:
         ends, covariance = np.array(t.ends, float), np.array(t.covariance, float).reshape(4, 4)
-        if not (
-            np.isfinite([*ends, *covariance.flat]).all()
-            and (ends[:2] != ends[2:]).any()
-            and np.allclose(covariance, covariance.T)
-            and np.linalg.eigvalsh(covariance)[0] > 0
-        ):
+        if not (_is_possible(covariance, *ends) and (ends[:2] != ends[2:]).any()):
             raise FrameError("trails: ends or covariance of a trail are impossible: measure it again.")
         trails.append(
             FrameTrail(

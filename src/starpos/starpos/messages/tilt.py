@@ -101,9 +101,8 @@ def _third_axis(message: Any) -> tuple[float, float]:
     if z == variance == 0:
         if math.sin(message.x) ** 2 + math.sin(message.y) ** 2 > 1 - SQUARE:
             raise TiltError(
-                "a tilt message leaves z and z_variance at 0, and its x and y alone fit a sensor on its "
-                "side: "
-                "send z and its variance, or NaN for a sensor of two axes."
+                "a tilt message leaves z and z_variance at 0, and its x and y alone fit a sensor on its side: send z and "
+                "its variance, or NaN for a sensor of two axes."
             )
         return math.nan, math.nan
     if not math.isfinite(z):

@@ -16,6 +16,7 @@ from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.navigation.preintegration import ERRORS, Pieces, Sums, summed
 from starpos.navigation.records import ImuModel, VelocityLog
 from starpos.navigation.vessel import MotionLaw, Vessel
+from starpos.rotation import normalised
 
 # Columns of a node: place m and velocity m/s in ITRS, attitude as a small rotation about ITRS's axes in rad, biases of
 # gyro and accelerometer. If a law of motion stands in for a velocity: also speed along the nose and drift in ITRS
@@ -393,8 +394,7 @@ def law_residuals(motion: Motion, law: MotionLaw) -> Residuals:
     """Equations of the nodes whose velocity is known only from the motion law: speed along the nose, drift, rest."""
     up, count = zenith_at(motion.place), len(motion)
     level = np.eye(3) - up[:, :, None] * up[:, None, :]
-    nose = np.einsum("kij,kj->ki", level, motion.attitude[:, :, 0])
-    nose /= np.linalg.norm(nose, axis=1, keepdims=True)
+    nose = normalised(np.einsum("kij,kj->ki", level, motion.attitude[:, :, 0]))
     drift = np.einsum("kij,kj->ki", level, motion.drift)
     rows = np.zeros((count, 3, BY_LAW + CONSTANTS + 1))
     rows[:, :, VELOCITY] = np.eye(3)

@@ -1,17 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a record itself shows of its assumptions: where the vehicle stands, and how well a law of motion holds.
 
-No single sign distinguishes a standing vehicle from one that rolls evenly and straight.  So three signs must agree.
-Its attitude is constant within the errors of the stars, which no vehicle that rolls on real ground achieves.  Its
-readings are quieter than while it surely moves: a vehicle whose motion is not felt never counts as standing.  And the
-rest of the record, without that standstill, determines its velocity well enough, and it is 0.  If one of them cannot be
-0, all are rejected: it is unknown which of the contradicting ones are true.
-
-Of a law of motion, only the motion across the nose shows how much wind and gusts change from one minute to the next,
-since the speed along the nose is unknown.  A trend, steady from end to end of the record, looks like an error of the
-place, so it cannot be used.  Minutes reveal it as far as a wind is a random walk.  A slow swing, half a wave or two over
-the record, hides a trend of its own size.  Calm air may drift without either, so the record may widen how fast the drift
-changes, and never narrows it.
+docs/navigation.md, how it works, says which signs have to agree and why.  Of a law of motion a trend, steady from end to
+end, cannot be used, since it looks like an error of the place; a slow swing hides a trend of its own size.
 """
 
 from dataclasses import dataclass, replace
@@ -25,6 +16,7 @@ from starpos.navigation.chain import Smoothed
 from starpos.navigation.equations import Motion, Residuals, StarAttitudes
 from starpos.navigation.preintegration import Pieces
 from starpos.navigation.vessel import MotionLaw
+from starpos.rotation import normalised
 from starpos.units import ARCSEC
 
 # turn rate (rad/s) above which it surely moves, and minimum time (s) between the frames that show it
@@ -209,7 +201,9 @@ def borne_out(law: MotionLaw, motion: Motion) -> MotionLaw:
     number = int(min(t[-1] // MEAN_S, MAX_MEANS))
     if number < MIN_MEANS:
         return law
-    side, across = _sideways(motion)
+    # level, across the nose, and the velocity along it
+    side = normalised(np.cross(zenith_at(motion.place), motion.attitude[:, :, 0]))
+    across = np.einsum("ki,ki->k", side, motion.velocity)
     latitude, longitude, _ = (float(x) for x in geodetic_place(motion.place[len(motion) // 2]))
     means = independent_means(t, side @ enu_axes(latitude, longitude)[:2].T, across, number)
     rest = law.rest_stddev * law.longer(float(np.median(np.diff(t))))
@@ -230,13 +224,6 @@ def borne_out(law: MotionLaw, motion: Motion) -> MotionLaw:
         drift_walk=law.drift_walk * float(np.sqrt(walk2 + trend2)),
         rest_stddev=law.rest_stddev * max(float(np.sqrt(rest2)), gusts / rest),
     )
-
-
-def _sideways(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Level directions (K, 3) across the nose at each node, and the velocity (K,) along them."""
-    side = np.cross(zenith_at(motion.place), motion.attitude[:, :, 0])
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    return side, np.einsum("ki,ki->k", side, motion.velocity)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -4,6 +4,7 @@
 from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 
 import numpy as np
 
@@ -20,6 +21,7 @@ READING_S = 0.02
 LONGEST_GAP_S, BACK_S = 30.0, 1.0
 # of frames with stars, whatever their stamps
 MAX_FRAMES = 100_000
+_time = attrgetter("utc_unix_s")
 # no vehicle turns or is pushed as much, rad/s and m/s2
 MAX_RATE, MAX_FORCE = 100.0, 1000.0
 
@@ -159,7 +161,3 @@ class Recent:
             return adjust_voyage(frames, imu, log, vessel)
 
         return adjusted
-
-
-def _time(frame: FrameUnderWay) -> float:
-    return frame.utc_unix_s

@@ -38,12 +38,14 @@ class FrameUnderWay(Sighting, ABC):
 
     def rough(self) -> Attitude:
         """The attitude as it is without a place, good to ROUGH."""
-        error = np.eye(3) * ROUGH**2
-        return Attitude(self.camera.rotation, error, of=CAMERA, into=ITRS, by_refraction=np.zeros(3))
+        return Attitude(self.camera.rotation, np.eye(3) * ROUGH**2, of=CAMERA, into=ITRS)
 
     @abstractmethod
-    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
-        """The attitude under a zenith (3,) in ITRS."""
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> tuple[Attitude, np.ndarray]:
+        """The attitude under a zenith (3,) in ITRS, and how it turns if refraction is stronger by its own size.
+
+        The turn is a small rotation (3,) about ITRS's axes, rad.
+        """
 
 
 # Refraction squeezes a frame more along the vertical than across. This turns the attitude across the axis if the middle
@@ -70,7 +72,7 @@ class PlacelessFrame(FrameUnderWay):
             camera=among_stars.then(earth_state(attitude.utc_unix_s).gcrs_to_itrs, ITRS),
         )
 
-    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> tuple[Attitude, np.ndarray]:
         """The attitude under a zenith (3,) in ITRS, from where stars around the camera's axis would be seen there.
 
         The attitude's covariance gives the distance of the frame's own stars from it.  The fitted plate scale has
@@ -90,7 +92,7 @@ class PlacelessFrame(FrameUnderWay):
         squeezed = float(np.linalg.norm(raised)) * np.sqrt(1 - min(height, 1.0) ** 2) / height
         uneven = squeezed * np.array([OFF_AXIS, OFF_AXIS, SPREAD])
         whole = covariance + np.diag(uneven**2)
-        return Attitude(camera, camera @ whole @ camera.T, of=CAMERA, into=ITRS, by_refraction=raised)
+        return Attitude(camera, camera @ whole @ camera.T, of=CAMERA, into=ITRS), raised
 
 
 def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> PlacelessFrame:
@@ -171,9 +173,7 @@ class SunFrame(FrameUnderWay):
         return cls(
             utc_unix_s=seen.utc_unix_s,
             stamp_stddev_s=seen.stamp_stddev_s,
-            camera=Attitude(
-                turn, turn @ seen.covariance @ turn.T, of=CAMERA, into=ITRS, by_refraction=np.zeros(3)
-            ),
+            camera=Attitude(turn, turn @ seen.covariance @ turn.T, of=CAMERA, into=ITRS),
             ray=seen.ray,
             body=body,
             place=place,
@@ -182,7 +182,7 @@ class SunFrame(FrameUnderWay):
     def rough(self) -> Attitude:
         return self.camera
 
-    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> tuple[Attitude, np.ndarray]:
         """The attitude under a zenith (3,) in ITRS, turned anyhow about the Sun."""
         true = self.body.from_place(zenith)
         level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
@@ -192,7 +192,7 @@ class SunFrame(FrameUnderWay):
         layers = raised**2 - (math.dist(seen, true) * atmosphere.relative_sigma) ** 2
         across = rotation.normalised(np.cross(zenith, seen))
         covariance = turn @ self.camera.covariance_about_own @ turn.T + layers * np.outer(across, across)
-        return Attitude(turn, covariance, of=CAMERA, into=ITRS, by_refraction=np.cross(true, seen))
+        return Attitude(turn, covariance, of=CAMERA, into=ITRS), np.cross(true, seen)
 
     def heading_by(self, link: Attitude) -> Attitude:
         """The body's attitude at the known place: level by the plumb line, north by WGS 84.
@@ -219,13 +219,12 @@ def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitu
     The errors are of stars, air, time, place, deflection and mount.
     """
     a4, air = place.plumb_axes, vessel.atmosphere
-    seen = frame.under(a4[2], air)
-    seen = seen.then(a4, ENU)
-    assert seen.by_refraction is not None
+    against_earth, by_refraction = frame.under(a4[2], air)
+    seen = against_earth.then(a4, ENU)
     late_s = [frame.stamp_stddev_s, vessel.clock_stddev_s, earth_orientation(frame.utc_unix_s).ut1_sigma_s]
     moved = zenith_moved(place.plumb[0])
     columns = np.column_stack([
-        seen.by_refraction * air.relative_sigma,
+        a4 @ by_refraction * air.relative_sigma,
         a4[:, 2] * ROTATION_RAD_S * math.hypot(*late_s),
         moved @ place.zenith_root,
         moved * np.array([[place.plumb_stddev], [place.plumb_stddev], [place.ellipsoid_stddev]]),

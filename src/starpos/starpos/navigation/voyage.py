@@ -347,12 +347,15 @@ class Adjustment:
                 f"the stars of {len(self.frames)} frames agree: at least {MIN_FRAMES} are needed"
             )
         air = self.vessel.atmosphere
-        found = [frame.rough() if zenith is None else frame.under(zenith, air) for frame in self.frames]
+        found = [
+            (frame.rough(), np.zeros(3)) if zenith is None else frame.under(zenith, air)
+            for frame in self.frames
+        ]
         return StarAttitudes(
             index=np.searchsorted(self.nodes, [frame.utc_unix_s for frame in self.frames]),
-            camera_to_itrs=np.array([a.rotation for a in found]),
-            covariance=np.array([a.covariance_about_own for a in found]),
-            by_refraction=np.array([a.rotation.T @ a.by_refraction for a in found]),
+            camera_to_itrs=np.array([a.rotation for a, _ in found]),
+            covariance=np.array([a.covariance_about_own for a, _ in found]),
+            by_refraction=np.array([a.rotation.T @ bent for a, bent in found]),
             stamp_stddev_s=np.array([frame.stamp_stddev_s for frame in self.frames]),
             rays=np.array([f.ray if isinstance(f, SunFrame) else np.zeros(3) for f in self.frames]),
         )

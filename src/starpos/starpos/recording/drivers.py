@@ -49,7 +49,6 @@ class DriverMessages:
         self._frames = self._tilts = 0
 
     def receive_capture(self, message: Any) -> None:
-        """Take a Capture."""
         self._exposures.keep_capture(message)
 
     def stars_of(self, kind: str, message: Any) -> tuple[Stars, PlainHeader]:

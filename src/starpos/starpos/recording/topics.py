@@ -3,7 +3,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starpos.errors import FrameError
@@ -45,12 +44,7 @@ def remaps_of(texts: Sequence[str]) -> Remaps:
     return topics
 
 
-def driver_topics(
-    connections: "Sequence[Connection]",
-    remaps: Remaps = NO_REMAPS,
-    namespace: str | None = None,
-    place: Path | str = "the bag",
-) -> dict[str, str]:
+def driver_topics(bag: BagReader, remaps: Remaps = NO_REMAPS, namespace: str | None = None) -> dict[str, str]:
     """Topics by the names of the DRIVER_INPUTS that they serve as; {} without images.
 
     The topic is the one that the user names, else the one with the input's own name, else the one next to the images (as
@@ -59,88 +53,61 @@ def driver_topics(
     namespace: only topics in it count, except for topics that the user names.
     Raises FrameError if several topics may be meant, or if a topic that the user names is missing or of another type.
     """
-    bag = _Topics(connections, remaps, namespace, f"{place}")
-    images = bag.of(RAW, "")
-    if images is None:
+    if (images := _topic_of(bag, RAW, remaps, namespace)) is None:
         return {}
     beside = images.removesuffix("/compressed").rpartition("/")[0]
     found = {RAW: images}
     levels = (IMU_DATA,) if IMU_DATA in remaps else ("tilt", IMU_DATA)
     for name in ("camera/camera_info", "camera/capture", *levels):
-        if not (name == IMU_DATA and "tilt" in found) and (topic := bag.of(name, beside)):
+        if name == IMU_DATA and "tilt" in found:
+            continue
+        if topic := _topic_of(bag, name, remaps, namespace, beside):
             found[name] = topic
     return found
 
 
-def named_topics(connections: "Sequence[Connection]", remaps: Remaps, place: Path | str) -> dict[str, str]:
-    """The topics that the user names, by the inputs they serve as; raises FrameError as `driver_topics` does."""
-    bag = _Topics(connections, remaps, None, f"{place}")
-    return {name: topic for name in remaps if (topic := bag.of(name, ""))}
+def _topic_of(
+    bag: BagReader, name: str, remaps: Remaps, namespace: str | None = None, beside: str = ""
+) -> str | None:
+    """The topic with messages that serves as an input, preferably next to others; None without one."""
+    kinds = {c.topic: c.msgtype for c in bag.connections}
+    if topic := remaps.get(name):
+        if topic not in kinds:
+            raise FrameError(f"{bag.path}: no topic {topic} in it; it has {', '.join(sorted(kinds))}")
+        if kinds[topic] not in DRIVER_INPUTS[name]:
+            raise FrameError(
+                f"{bag.path}: {topic} has {kinds[topic]}; {name} takes {', '.join(DRIVER_INPUTS[name])}"
+            )
+        return topic
+    below = f"/{(namespace or '').strip('/')}/".replace("//", "/")
+    heard = sorted({c.topic for c in bag.connections if c.msgcount and c.topic.startswith(below)})
+    for kind in DRIVER_INPUTS[name]:
+        topics = [t for t in heard if kinds[t] == kind]
+        own = [t for t in topics if t.removesuffix("/compressed").endswith(f"/{name}")]
+        near = [t for t in topics if beside and t.rpartition("/")[0] == beside]
+        for some in (own, near, topics):
+            if len(some) == 1:
+                return some[0]
+        if topics:
+            raise FrameError(
+                f"{bag.path}: {', '.join(topics)} are all {kind}: choose one with --remap {name}:={topics[0]}"
+            )
+    return None
 
 
 def sentence_on_use(found: Mapping[str, str], connections: "Sequence[Connection]") -> str:
-    """Sentence on the use of the topics that were found."""
     kinds = {c.topic: c.msgtype for c in connections}
     made = [f"{MADE_OF[kinds[t]]} from {t}" for t in found.values() if kinds[t] in MADE_OF]
     plain = [f"{name} is {t}" for name, t in found.items() if kinds[t] not in MADE_OF]
     return ", ".join(made + plain)
 
 
-@dataclass(frozen=True)
-class _Topics:
-    """The topics of a bag that have messages."""
-
-    connections: "Sequence[Connection]"
-    remaps: Remaps
-    namespace: str | None
-    place: str
-
-    def of(self, name: str, beside: str) -> str | None:
-        """The topic of an input, preferably next to `others`; None without one."""
-        if name in self.remaps:
-            return self._named(name, self.remaps[name])
-        for kind in DRIVER_INPUTS[name]:
-            topics = self._of_type(kind)
-            own = [t for t in topics if t.removesuffix("/compressed").endswith(f"/{name}")]
-            near = [t for t in topics if beside and t.rpartition("/")[0] == beside]
-            for some in (own, near, topics):
-                if len(some) == 1:
-                    return some[0]
-            if topics:
-                raise FrameError(
-                    f"{self.place}: {', '.join(topics)} are all {kind}: choose one with --remap {name}:={topics[0]}"
-                )
-        return None
-
-    def _of_type(self, kind: str) -> list[str]:
-        below = "/" + (self.namespace or "").strip("/")
-        return sorted(
-            {
-                c.topic
-                for c in self.connections
-                if c.msgtype == kind and c.msgcount and (below == "/" or c.topic.startswith(f"{below}/"))
-            }
-        )
-
-    def _named(self, name: str, topic: str) -> str:
-        kinds = {c.topic: c.msgtype for c in self.connections}
-        if topic not in kinds:
-            raise FrameError(f"{self.place}: no topic {topic} in it; it has {', '.join(sorted(kinds))}")
-        if kinds[topic] not in DRIVER_INPUTS[name]:
-            raise FrameError(
-                f"{self.place}: {topic} has {kinds[topic]}; {name} takes {', '.join(DRIVER_INPUTS[name])}"
-            )
-        return topic
-
-
 STARS, TRAILS, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "TrailArray", "Solution"))
 # types by the relative names of the solver's inputs
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}
-# further inputs, with gnss.use
-GNSS = {"gnss/fix": NAV_SAT_FIX}
-# further inputs, with satellites.elements
-SATELLITES = {"trails": TRAILS}
+# with gnss.use and with satellites.elements, too
+ALL_INPUTS = {**INPUTS, "gnss/fix": NAV_SAT_FIX, "trails": TRAILS}
 
 
 @dataclass(frozen=True)
@@ -168,9 +135,9 @@ def instrument_in(
                 found.setdefault(c.topic.removesuffix(suffix).rstrip("/") or "/", []).append(c)
     able = sorted(n for n, cs in found.items() if any(c.msgtype == STARS and c.msgcount for c in cs))
     if not able or RAW in remaps:
-        drivers = driver_topics(bag.connections, remaps, namespace, bag.path)
-        if drivers:
-            return _of_drivers(bag, drivers, namespace)
+        if drivers := driver_topics(bag, remaps, namespace):
+            used = [c for c in bag.connections if c.topic in drivers.values()]
+            return Chosen("/" + (namespace or "").strip("/"), used, sentence_on_use(drivers, used))
         raise FrameError(
             f"{bag.path}: no stars in it, and no images: record stars, tilt and camera/camera_info, or the images and "
             "the IMU of a robot"
@@ -184,14 +151,8 @@ def instrument_in(
         raise FrameError(
             f"{bag.path}: the instruments in it are {', '.join(able)}: choose one with --namespace"
         )
-    named = named_topics(bag.connections, remaps, bag.path)
+    named = {name: topic for name in remaps if (topic := _topic_of(bag, name, remaps))}
     replaced = {INPUTS.get("tilt" if name == IMU_DATA else name) for name in named}
     own = [c for c in found[wanted] if c.msgtype not in replaced]
     others = [c for c in bag.connections if c.topic in named.values()]
     return Chosen(wanted, [*own, *others], sentence_on_use(named, others))
-
-
-def _of_drivers(bag: BagReader, drivers: Mapping[str, str], namespace: str | None) -> Chosen:
-    used = set(drivers.values())
-    connections = [c for c in bag.connections if c.topic in used]
-    return Chosen("/" + (namespace or "").strip("/"), connections, sentence_on_use(drivers, connections))

@@ -5,8 +5,9 @@ are here because they must forget at the same events: an average holds for one i
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from types import coroutine
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from starpos.identification import Identification
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
 from starpos.instrument.tilt_log import TiltLog, TiltsByTime
-from starpos.session.driver import Coming, Diagnosis, Jobs, Level, Log, Outcome
+from starpos.session.driver import Diagnosis, Jobs, Level, Log, Outcome
 from starpos.session.settings import Settings
 from starpos.session.standing import Averaging, News
 
@@ -42,7 +43,6 @@ class Seen:
 
     @property
     def mid_unix_s(self) -> float:
-        """Middle of the exposure."""
         assert self.stars.mid_unix_s is not None
         return self.stars.mid_unix_s
 
@@ -62,27 +62,24 @@ class _Pose:
         self.tilts.append(seen.tilt)
 
 
-class PoseMemory:
+class PoseMemory(deque[_Pose]):
     """Keeps each pose's last frame with the mean tilt of the pose; drops the oldest poses."""
 
     def __init__(self) -> None:
-        self._poses: deque[_Pose] = deque(maxlen=MAX_POSES)
-
-    def __len__(self) -> int:
-        return len(self._poses)
+        super().__init__(maxlen=MAX_POSES)
 
     def keep(self, seen: Seen, fix: Fix) -> bool:
         """Keep a frame; return whether a new calibration is worthwhile: a new pose, or one with twice as many frames."""
-        if not self._poses or slip_s(fix.camera, self._poses[-1].first.camera, fix.latitude) != 0:
-            self._poses.append(_Pose(fix, seen))
-        pose = self._poses[-1]
+        if not self or slip_s(fix.camera, self[-1].first.camera, fix.latitude) != 0:
+            self.append(_Pose(fix, seen))
+        pose = self[-1]
         pose.keep(seen)
         return pose.frames & (pose.frames - 1) == 0
 
     def frames(self) -> list[Seen]:
         """Return a frame for each pose whose tilts agree, the oldest first."""
         made = []
-        for pose in self._poses:
+        for pose in self:
             try:
                 made.append(replace(pose.newest, tilt=mean_tilt(pose.tilts)))
             except TiltError:
@@ -92,11 +89,8 @@ class PoseMemory:
 
     def forget_before(self, utc_unix_s: float) -> None:
         """Drop the poses before that time, because the instrument has moved then."""
-        while self._poses and self._poses[0].newest.mid_unix_s < utc_unix_s:
-            self._poses.popleft()
-
-    def clear(self) -> None:
-        self._poses.clear()
+        while self and self[0].newest.mid_unix_s < utc_unix_s:
+            self.popleft()
 
 
 def mean_tilt(tilts: Sequence[Tilt]) -> Tilt:
@@ -157,9 +151,8 @@ def _newest_is_off(fixes: list[Fix]) -> bool:
 MIN_HEADINGS, MIN_BY_ITSELF = 3, 4
 TURN_IT = "turn it on the spot"
 CALIBRATE_IT = (
-    "fixes have errors of over 1000 km. Set calibration_url or misalignment_stddev, call solver/calibrate "
-    "at a known place, or "
-    "set self_calibration and turn it on the spot"
+    "fixes have errors of over 1000 km. Set calibration_url or misalignment_stddev, call solver/calibrate at a known "
+    "place, or set self_calibration and turn it on the spot"
 )
 # Number of old frames in a row, in order, that show that a bag is played again.
 LATE_FRAMES = 3
@@ -202,40 +195,27 @@ class Calibrating:
         self._newest_unix_s = self._late_unix_s = -math.inf
         # Number of frames in a row that are older than the newest, each younger than the one before.
         self._late = 0
-        # Standard deviation of the plumb line in `found`; nan: not known.
-        self._plumb_arcsec = math.nan
+        # What `found` with its error comes from; None where that is no frames.
+        self._calibrated: Calibrated | None = None
         # Grows when the instrument or the place changes; a job of an older era is out of date.
         self._era = 0
         self._worker = jobs
-        self._running: Coming | None = None
         # Whether a service waits for a job.
         self._asked = False
         # Whether to calibrate by itself again when there is time.
         self._again = False
-        # A sentence about `found`.
-        self._about = ""
         # Why the last calibration by itself was not taken.
         self._said = ""
 
     @property
-    def busy(self) -> bool:
-        """Whether a calibration is being worked out."""
-        return self._worker.busy
-
-    @property
     def about(self) -> str:
         """A sentence about the calibration that was found; '' without one."""
-        return self._about
+        return _about(self._calibrated) if self._calibrated else ""
 
     @property
     def unknown(self) -> bool:
         """Whether A3 is not known, so that fixes carry its error."""
-        return not self._is_found and self._settings.instrument(self.found).calibration.unknown
-
-    @property
-    def _is_found(self) -> bool:
-        """Whether A3 and its error come from frames."""
-        return not math.isnan(self._plumb_arcsec)
+        return self._calibrated is None and self._settings.instrument(self.found).calibration.unknown
 
     # events of the session ----------------------------------------------------------------------------------------------
 
@@ -254,10 +234,10 @@ class Calibrating:
             return False
         news = self.average.include(fix)
         # While A3 is not known, turning looks like moving.
-        if self._is_found and news is News.MOVED:
+        if self._calibrated and news is News.MOVED:
             self._era += 1
             self._poses.forget_before(self.average.began_unix_s)
-        if self._is_found and news is News.LEFT_OUT:
+        if self._calibrated and news is News.LEFT_OUT:
             return False
         worthwhile = self._poses.keep(seen, fix)
         if self._values["self_calibration"] and (worthwhile or self._again):
@@ -310,15 +290,12 @@ class Calibrating:
 
     def _drop(self, instead: Calibration | None) -> None:
         self._era += 1
-        self.found, self._plumb_arcsec = instead, math.nan
-        self._about = self._said = ""
+        self.found, self._calibrated, self._said = instead, None, ""
 
     def _adopt(self, calibrated: Calibrated) -> None:
         self._era += 1
-        self.found = calibrated.instrument.calibration
-        self._plumb_arcsec = calibrated.plumb_stddev_arcsec
-        self._about = _about(calibrated)
-        self._log.info(self._about)
+        self.found, self._calibrated = calibrated.instrument.calibration, calibrated
+        self._log.info(self.about)
         self.average.begin_anew()
         self._changed()
 
@@ -391,7 +368,7 @@ class Calibrating:
         except StarposError as e:
             self._said = str(e)
             return
-        self._run(job).add_done_callback(lambda future: self._turned_by_itself(future.result(), era))
+        self._worker.run(job, lambda outcome: self._turned_by_itself(outcome, era))
 
     def _turned_by_itself(self, outcome: Outcome, era: int) -> None:
         if era == self._era:
@@ -401,7 +378,7 @@ class Calibrating:
             self._said = said
             if not said:
                 self._adopt_turned(outcome.value)
-            elif outcome.trouble and self._is_found:
+            elif outcome.trouble and self._calibrated:
                 # The newest heading does not fit the others: the place has changed.
                 self._moved_on(self._newest_unix_s)
         if self._again:
@@ -417,9 +394,8 @@ class Calibrating:
             )
         if not found <= limit:
             return (
-                f"the headings determine the plumb line in the camera to {found:.0f} arcsec only, "
-                f"self_calibration_limit is "
-                f"{limit:g}: turn the instrument further, or to more headings"
+                f"the headings determine the plumb line in the camera to {found:.0f} arcsec only, self_calibration_limit "
+                f"is {limit:g}: turn the instrument further, or to more headings"
             )
         return ""
 
@@ -428,14 +404,13 @@ class Calibrating:
 
         The zero of the inclinometer drifts, so the calibration in use gets worse with time.
         """
-        if self.found is None or not self._is_found:
+        if (before := self._calibrated) is None:
             return True
-        now = calibrated.instrument.calibration.utc_unix_s
-        hours = abs(now - self.found.utc_unix_s) / 3600
-        drift = np.degrees(calibrated.instrument.inclinometer.drift_rad_per_sqrt_hour) * 3600
-        return calibrated.plumb_stddev_arcsec < BETTER * math.hypot(
-            self._plumb_arcsec, drift * math.sqrt(hours)
-        )
+        found, known = calibrated.instrument, before.instrument
+        hours = abs(found.calibration.utc_unix_s - known.calibration.utc_unix_s) / 3600
+        drift = np.degrees(found.inclinometer.drift_rad_per_sqrt_hour) * 3600
+        now_arcsec = math.hypot(before.plumb_stddev_arcsec, drift * math.sqrt(hours))
+        return calibrated.plumb_stddev_arcsec < BETTER * now_arcsec
 
     def _adopt_turned(self, turned: Turned) -> None:
         self._adopt(turned.calibrated)
@@ -449,36 +424,40 @@ class Calibrating:
             return Outcome(trouble="another calibration is being worked out: call again when it has answered")
         self._asked = True
         try:
-            if self._worker.busy and self._running is not None:
-                await self._running
-            job, era = prepare(), self._era
-            outcome = await self._run(job)
+            await _until(lambda: not self._worker.busy)
+            era, came = self._era, deque[Outcome]()
+            self._worker.run(prepare(), came.append)
+            await _until(lambda: bool(came))
         except StarposError as e:
             return Outcome(trouble=str(e))
         finally:
             self._asked = False
         if era != self._era:
             changed = "the instrument was changed, moved or reset meanwhile: call again"
-            return Outcome(trouble=outcome.trouble or changed)
-        return outcome
-
-    def _run(self, job: Callable[[], object]) -> Coming:
-        self._running = self._worker.run(job)
-        return self._running
+            return Outcome(trouble=came[0].trouble or changed)
+        return came[0]
 
     def report(self) -> Diagnosis:
         """Make the diagnostic `Calibration`."""
         values: dict[str, object] = {"frames kept": len(self._recent), "headings": len(self._poses)}
         values |= {"self-calibration": self._values["self_calibration"], "working": self._worker.busy}
         values |= {"last turn on the spot": self._said}
-        if self._is_found and self.found is not None:
-            values |= {"plumb line (arcsec)": self._plumb_arcsec, "found of frames": self.found.frames}
+        if (found := self._calibrated) is not None:
+            frames = found.instrument.calibration.frames
+            values |= {"plumb line (arcsec)": found.plumb_stddev_arcsec, "found of frames": frames}
         if self.unknown:
             remedy = (self._said or TURN_IT) if self._values["self_calibration"] else CALIBRATE_IT
             return Diagnosis(
                 Level.WARN, f"the misalignment of camera and inclinometer is not known: {remedy}", values
             )
-        return Diagnosis(Level.OK, self._about or "from the parameters", values)
+        return Diagnosis(Level.OK, self.about or "from the parameters", values)
+
+
+@coroutine
+def _until(done: Callable[[], bool]) -> Iterator[None]:
+    """Wait in a coroutine of the node, which its executor resumes again and again."""
+    while not done():
+        yield
 
 
 def _about(found: Calibrated) -> str:

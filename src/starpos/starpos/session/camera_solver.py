@@ -21,7 +21,6 @@ class CameraSolver:
     make: makes the Solver for a camera with the present parameters and calibration; it may raise a StarposError.
     changed: called when the camera is another one.  say: takes a sentence about why there is no Solver, or what the
     catalogue lacks for it.
-    topic: full name of the topic of the camera's intrinsics.
     """
 
     def __init__(
@@ -116,18 +115,12 @@ class CameraSolver:
 
     def _begin(self, camera: Camera | str) -> None:
         """Use a camera, or none, for the reason given."""
-        if isinstance(camera, Camera):
-            self._use(camera)
-            return
-        known, self.camera, self.solver, self.trouble = self.camera, None, None, camera
-        if known is not None:
+        before, self.solver = self.camera, None
+        self.camera, self.trouble = (camera, "") if isinstance(camera, Camera) else (None, camera)
+        if before != self.camera:
             self._changed()
-
-    def _use(self, camera: Camera) -> None:
-        self.camera, self.solver, self.trouble = camera, None, ""
-        self._changed()
-        if not self.preparing:
-            self._prepare(camera)
+        if self.camera is not None and not self.preparing:
+            self._prepare(self.camera)
 
     def _prepare(self, camera: Camera) -> None:
         """Prepare the triangles of this field as a job, because building them takes seconds."""
@@ -136,7 +129,7 @@ class CameraSolver:
             solver = self._make(camera)
             return solver, solver.prepare(camera.width, camera.height)
 
-        self._jobs.run(work).add_done_callback(lambda f: self._prepared(camera, f.result()))
+        self._jobs.run(work, lambda made: self._prepared(camera, made))
 
     def _prepared(self, camera: Camera, made: Outcome) -> None:
         if self.camera is None:

@@ -13,7 +13,7 @@ from starpos.frames.frame import Stars
 from starpos.identification import Identification
 from starpos.instrument.tilt_log import Tilts
 from starpos.session.calibrating import OF_AVERAGE
-from starpos.session.driver import Diagnosis, Jobs, Level
+from starpos.session.driver import Diagnosis, Jobs, Level, Outcome
 from starpos.session.settings import Settings
 from starpos.zenith.adjustment import DeflectionSession
 from starpos.zenith.doubts import checked_session
@@ -33,7 +33,7 @@ class LiveDeflection:
     """Collects sightings at the mark of the parameters, while deflection.wanted is set, and adjusts them in a job."""
 
     def __init__(self, settings: Settings, jobs: Jobs) -> None:
-        self._settings, self._jobs, self._era = settings, jobs, 0
+        self._settings, self._jobs = settings, jobs
         self.forget()
 
     def forget(self) -> None:
@@ -43,23 +43,12 @@ class LiveDeflection:
         self._trouble = self._left_out = ""
         # number of frames in the last adjustment
         self._adjusted_of = 0
-        # a job of an older session is out of date
-        self._era += 1
+        self._jobs.disown()
 
     @property
     def measures(self) -> bool:
         """Whether a deflection is measured."""
-        return not math.isnan(self.wanted_arcsec)
-
-    @property
-    def wanted_arcsec(self) -> float:
-        """The error that is enough; NaN where no deflection is measured."""
-        return float(self._settings.values["deflection.wanted"])
-
-    @property
-    def busy(self) -> bool:
-        """Whether an adjustment runs."""
-        return self._jobs.busy
+        return not math.isnan(self._settings.values["deflection.wanted"])
 
     def parameters_set(self, names: frozenset[str]) -> None:
         """Begin a new session where the mark, the instrument or the air has changed."""
@@ -84,18 +73,14 @@ class LiveDeflection:
             self._adjust(solver, mark)
 
     def _adjust(self, solver: Solver, mark: Place) -> None:
-        era, sightings = self._era, tuple(self._sightings)
+        sightings = tuple(self._sightings)
         self._adjusted_of = len(sightings)
         # an A3 that was found by turning comes from these very frames
         instrument, air = self._settings.instrument(None), solver.atmosphere
-        coming = self._jobs.run(lambda: checked_session(sightings, instrument, air, mark))
+        self._jobs.run(lambda: checked_session(sightings, instrument, air, mark), self._adjusted)
 
-        def done(result: object) -> None:
-            outcome = coming.result()
-            if era == self._era:
-                self._found, self._trouble = outcome.value, outcome.trouble
-
-        coming.add_done_callback(done)
+    def _adjusted(self, made: Outcome) -> None:
+        self._found, self._trouble = made.value, made.trouble
 
     def report(self) -> Diagnosis:
         """What the session has so far, and whether it is enough."""
@@ -103,7 +88,7 @@ class LiveDeflection:
             waiting = f"{len(self._sightings)} frames so far"
             said = self._trouble or self._left_out or "point the camera at the zenith"
             return Diagnosis(Level.WARN, f"{waiting}: {said}", {"frames": len(self._sightings)})
-        found, wanted = self._found, self.wanted_arcsec
+        found, wanted = self._found, self._settings.values["deflection.wanted"]
         sigma = float(found.sigma_arcsec.max())
         faces = int(found.faces.max()) + 1
         enough = sigma <= wanted and not self._trouble

@@ -3,7 +3,7 @@
 
 import math
 import traceback
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -177,25 +177,6 @@ class Outcome:
     trouble: str = ""
 
 
-class Coming(Protocol):
-    """An Outcome that will come, as rclpy's Future."""
-
-    def add_done_callback(self, callback: Callable[[Any], None]) -> None: ...
-
-    def result(self) -> Any: ...
-
-    def __await__(self) -> Generator[Any, Any, Any]: ...
-
-
-class Jobs(Protocol):
-    """Runs one job at a time; its Outcome comes when its owner is free for it, never within `run`."""
-
-    @property
-    def busy(self) -> bool: ...
-
-    def run(self, job: Callable[[], Any]) -> Coming: ...
-
-
 def outcome_of(job: Callable[[], Any], say: Callable[[str], object]) -> Outcome:
     """Do a job; a defect ends this job only, and `say` gets its traceback."""
     try:
@@ -207,55 +188,46 @@ def outcome_of(job: Callable[[], Any], say: Callable[[str], object]) -> Outcome:
         return Outcome(trouble=f"it failed ({type(e).__name__}: {e})")
 
 
-class _Promised:
-    """The Outcome of a job that JobsInTurn runs."""
+class Jobs:
+    """Runs one job at a time; a subclass says where."""
 
     def __init__(self) -> None:
-        self._outcome: Outcome | None = None
-        self._callbacks: list[Callable[[Any], None]] = []
+        self.busy = False
+        self._then: Callable[[Outcome], object] | None = None
 
-    def add_done_callback(self, callback: Callable[[Any], None]) -> None:
-        self._callbacks.append(callback)
+    def run(self, job: Callable[[], Any], then: Callable[[Outcome], object]) -> None:
+        """Begin a job; `then` gets its Outcome, never within this call. Must not be called while one runs."""
+        assert not self.busy
+        self.busy, self._then = True, then
+        self._begin(job)
 
-    def result(self) -> Outcome | None:
-        return self._outcome
+    def disown(self) -> None:
+        """Drop the outcome of the job that runs, because what it is of has changed."""
+        self._then = None
 
-    def __await__(self) -> Generator[Any, Any, Any]:
-        while self._outcome is None:
-            yield
-        return self._outcome
+    def _begin(self, job: Callable[[], Any]) -> None:
+        raise NotImplementedError
 
-    def come(self, outcome: Outcome) -> None:
-        self._outcome = outcome
-        for callback in self._callbacks:
-            callback(self)
+    def _end(self, outcome: Outcome) -> None:
+        then, self._then, self.busy = self._then, None, False
+        if then is not None:
+            then(outcome)
 
 
-class JobsInTurn:
+class JobsInTurn(Jobs):
     """Jobs that are done in this thread, each at the next `work`."""
 
     def __init__(self, say: Callable[[str], object]) -> None:
+        super().__init__()
         self._say = say
-        self._next: tuple[Callable[[], Any], _Promised] | None = None
 
-    @property
-    def busy(self) -> bool:
-        """Whether a job waits."""
-        return self._next is not None
-
-    def run(self, job: Callable[[], Any]) -> _Promised:
-        """Keep a job for `work`; must not be called while one waits."""
-        assert self._next is None
-        self._next = job, _Promised()
-        return self._next[1]
+    def _begin(self, job: Callable[[], Any]) -> None:
+        self._job = job
 
     def work(self) -> None:
         """Do the job that waits, if there is one."""
-        if self._next is not None:
-            job, promised = self._next
-            outcome = outcome_of(job, self._say)
-            self._next = None
-            promised.come(outcome)
+        if self.busy:
+            self._end(outcome_of(self._job, self._say))
 
 
 def name_in(message: Any) -> str:

@@ -5,6 +5,7 @@ position is compared with the star fix and never fused with it, so that each can
 
 import math
 from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical
-from starpos.errors import GnssError, PlaceError, StarposError
+from starpos.errors import GnssError, PlaceError
 from starpos.files import path_of
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
@@ -24,7 +25,17 @@ from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssStatus, GnssWatch
 from starpos.instrument.instrument import Instrument
-from starpos.session.driver import ANOTHER_TIME_S, Diagnosis, Heard, Jobs, Level, Log, Now, refusing
+from starpos.session.driver import (
+    ANOTHER_TIME_S,
+    Diagnosis,
+    Heard,
+    Jobs,
+    Level,
+    Log,
+    Now,
+    outcome_of,
+    refusing,
+)
 from starpos.session.reports import AHEAD_S, ONE_CLOCK
 from starpos.session.settings import Settings
 from starpos.units import ARCSEC, utc_text
@@ -83,7 +94,6 @@ class RecentPlaces:
         return GnssTrack(self._places[first : self._first_since(utc_unix_s + NEAREST_S) + 1]).at(utc_unix_s)
 
     def forget(self) -> None:
-        """Forget all places."""
         self._places.clear()
 
     def _first_since(self, utc_unix_s: float) -> int:
@@ -224,20 +234,18 @@ class GnssTeacher:
         due = not self._jobs.busy and abs(now.waiting_s - self._saved_s) >= SAVE_EVERY_S
         if due and self._worth_saving:
             self._saved_s = now.waiting_s
-            path, learned = path_of(self._values["gnss.learned"]), self.learned
-            assert learned is not None
-            self._saved = learned
-            coming = self._jobs.run(lambda: states.save_learned(path, learned))
-            coming.add_done_callback(lambda f: self._note(f.result().trouble))
+            self._jobs.run(self._saving(), lambda made: self._note(made.trouble))
 
     def close(self) -> None:
         """Write what was learned, at the end."""
         if self._worth_saving:
-            assert self.learned is not None
-            try:
-                states.save_learned(path_of(self._values["gnss.learned"]), self.learned)
-            except StarposError as error:
-                self._note(str(error))
+            self._note(outcome_of(self._saving(), self._log.error).trouble)
+
+    def _saving(self) -> Callable[[], None]:
+        path, learned = path_of(self._values["gnss.learned"]), self.learned
+        assert learned is not None
+        self._saved = learned
+        return lambda: states.save_learned(path, learned)
 
     @property
     def _worth_saving(self) -> bool:
@@ -256,18 +264,13 @@ class GnssTeacher:
 
     def report(self) -> Diagnosis:
         """Make the diagnostic `GNSS`."""
-        compared = None if self.newest is None else self.newest.compared
+        check = None if self.newest is None else self.newest.compared
         values = self._values_of(self.learned)
         if self._trouble:
             return Diagnosis(Level.WARN, self._trouble, values)
-        if compared is None:
-            since = (
-                "no frame with a GNSS place yet"
-                if self.newest is None
-                else "no GNSS place at the newest frame"
-            )
+        if check is None:
+            since = "no GNSS place at the newest frame" if self.newest else "no frame with a GNSS place yet"
             return Diagnosis(Level.WARN, f"{since}: the stars' place goes on with what was learned", values)
-        check = compared
         values |= {
             "status": check.status.value,
             "distance (m)": check.distance_m,

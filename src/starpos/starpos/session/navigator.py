@@ -32,7 +32,7 @@ from starpos.navigation.voyage import MIN_FRAMES, Voyage
 from starpos.session.driver import Changes, Diagnosis, Heard, Jobs, Level, Log, Now, Outcome, refusing
 from starpos.session.gnss import OLDEST_S, ComparedPlaces, contradiction
 from starpos.session.reports import AHEAD_S
-from starpos.session.settings import MIN_CLOCK_S, NodeSettings, atmosphere_of
+from starpos.session.settings import MIN_CLOCK_S, NodeSettings
 
 # of a stated altitude: the vehicle goes up and down by more than its file says
 MIN_HEIGHT_STDDEV_M = 10.0
@@ -62,7 +62,7 @@ class NavigatorSettings(NodeSettings):
             model=self._files["imu_model"] or ImuModel(),
             camera_to_body=np.asarray(known.link_to_camera, float).T,
             mount_stddev=float(np.radians(values["mount_stddev"])),
-            atmosphere=atmosphere_of(values),
+            atmosphere=self.atmosphere,
             clock_stddev_s=max(known.clock_stddev_s, clock_stddev_s) if np.isnan(clock) else clock,
             drift_stddev=values["drift_stddev"],
             **stated,
@@ -123,8 +123,7 @@ class NavigatorSession:
         self._seen_s = -math.inf
         self._clock_stddev_s = 0.0
         self._gnss = ComparedPlaces()
-        # marks outcomes of jobs that began before as out of date
-        self._voyage = object()
+        self._jobs.disown()
 
     @property
     def busy(self) -> bool:
@@ -219,8 +218,7 @@ class NavigatorSession:
             raise VoyageError(f"{what} has no time stamp: set header.stamp to when it was measured")
         if now.ahead_s(unix_s) > AHEAD_S:
             raise VoyageError(
-                f"{what} is stamped {now.ahead_s(unix_s):.3g} s in the future: set the clocks of camera, "
-                f"IMU and "
+                f"{what} is stamped {now.ahead_s(unix_s):.3g} s in the future: set the clocks of camera, IMU and "
                 "navigator by one source"
             )
 
@@ -257,15 +255,11 @@ class NavigatorSession:
         if len(inside) < MIN_FRAMES or time_s - recent.readings.first_s < SHORTEST_S:
             return
         self._adjusted_s = time_s
-        vessel, voyage = self._settings.vessel(self._clock_stddev_s), self._voyage
+        vessel = self._settings.vessel(self._clock_stddev_s)
         sun = next((f for f in reversed(inside) if isinstance(f, SunFrame)), None)
-        self._jobs.run(recent.job(vessel)).add_done_callback(
-            lambda f: self._adjusted(f.result(), voyage, sun)
-        )
+        self._jobs.run(recent.job(vessel), lambda made: self._adjusted(made, sun))
 
-    def _adjusted(self, made: Outcome, voyage: object, sun: SunFrame | None) -> None:
-        if voyage is not self._voyage:
-            return
+    def _adjusted(self, made: Outcome, sun: SunFrame | None) -> None:
         self.counts["adjustments"] += 1
         self._trouble, self._faults = made.trouble, ()
         if made.trouble:

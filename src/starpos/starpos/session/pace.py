@@ -131,7 +131,7 @@ class Waiting:
         return replace(self, ahead_s=min(now.ahead_s(self.stars.mid_unix_s), self.ahead_s))
 
 
-class Backlog:
+class Backlog(deque[Waiting]):
     """Frames in the order in which they came.
 
     A new frame is taken if those before it can be answered by the time its own tilts come or within MAX_LATE_S, or if at
@@ -140,24 +140,10 @@ class Backlog:
     """
 
     def __init__(self) -> None:
-        self._frames: deque[Waiting] = deque()
+        super().__init__()
         self._costs_s: deque[float] = deque(maxlen=COSTS)
         # when the last answer was begun, if another frame was ready behind it; NaN otherwise
         self._begun_s = math.nan
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    @property
-    def first(self) -> Waiting:
-        return self._frames[0]
-
-    @first.setter
-    def first(self, frame: Waiting) -> None:
-        self._frames[0] = frame
-
-    def clear(self) -> None:
-        self._frames.clear()
 
     def has_room(self, delay_s: float) -> bool:
         """Whether another frame can be answered in time; delay_s: for how long frames wait for their tilts."""
@@ -166,22 +152,19 @@ class Backlog:
         cost_s = statistics.median(self._costs_s) if self._costs_s else 0.0
         return len(self) * cost_s <= max(delay_s, MAX_LATE_S) + cost_s
 
-    def append(self, frame: Waiting) -> None:
-        self._frames.append(frame)
-
     def keep_newest(self) -> int:
         """Drop all but the newest few; returns how many were dropped."""
         dropped = max(len(self) - MAX_NEWEST, 0)
         for _ in range(dropped):
-            self._frames.popleft()
+            self.popleft()
         return dropped
 
-    def pop(self, now_s: float) -> Waiting:
-        """The first frame, which is answered from now on."""
+    def take(self, now_s: float) -> Waiting:
+        """Pop the first frame, which is answered from now on."""
         if not math.isnan(self._begun_s):
             self._costs_s.append(now_s - self._begun_s)
         self._begun_s = now_s
-        return self._frames.popleft()
+        return self.popleft()
 
     def pause(self) -> None:
         """Note that no frame is ready: until the next one the processor is idle."""

@@ -27,7 +27,7 @@ from starpos.night.reading import stars_of
 from starpos.recording import topics
 from starpos.recording.bag import BagReader
 from starpos.recording.drivers import IMAGES, DriverMessages, Drivers
-from starpos.session.driver import Answered, Averaged, Heard, JobsInTurn, Log, Now, Output, Sent
+from starpos.session.driver import Answered, Averaged, Heard, JobsInTurn, Log, Now, Output
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings
 
@@ -46,7 +46,6 @@ class Replay:
     def __init__(self, settings: Settings, heard: Heard, log: Log, drivers: Drivers | None = None) -> None:
         self.frames = 0
         self.remarks: list[str] = []
-        self._tilts = 0
         self._jobs: list[JobsInTurn] = []
         self._heard, self._log = heard, log
         self._drivers = Drivers.of() if drivers is None else drivers
@@ -63,10 +62,7 @@ class Replay:
         """
         now_ns, messages = 0, DriverMessages(self._drivers)
         with BagReader(path, typed=True) as bag:
-            inputs = topics.INPUTS if self.session.gnss is None else topics.INPUTS | topics.GNSS
-            if self.session.satellites is not None:
-                inputs = inputs | topics.SATELLITES
-            chosen = topics.instrument_in(bag, namespace, inputs, self._drivers.remaps)
+            chosen = topics.instrument_in(bag, namespace, self.session.inputs, self._drivers.remaps)
             if chosen.made:
                 self.remarks.append(chosen.made)
             for connection, log_ns, message in bag.decoded(chosen.connections):
@@ -93,41 +89,27 @@ class Replay:
                 stamp = PlainStamp.of_ns(round((message.mid_unix_s or 0.0) * 1e9))
                 yield from self.session.receive_detected(message, PlainHeader(stamp, "camera"), now)
             else:
-                yield from self._receive_tilt(message, now)
+                yield from self.session.receive(topics.TILT, message, now)
             yield from self._settled(now)
         yield from self._ended(now)
 
     def _taken(self, kind: str, message: Any, messages: DriverMessages, now: Now) -> list[Output]:
         """Have the session take a message, or the stars or tilt made from it."""
         session = self.session
-        if kind == topics.TILT:
-            return self._receive_tilt(message, now)
-        if kind == topics.STARS:
-            self.frames += 1
-            return session.receive_stars(message, now)
+        self.frames += kind == topics.STARS or kind in IMAGES
         if kind in IMAGES:
-            self.frames += 1
             try:
                 stars, header = messages.stars_of(kind, message)
             except StarposError as error:
                 self._heard.refuse("image_raw", str(error))
                 return []
             return session.receive_detected(stars, header, now)
-        if kind == topics.IMU:
-            tilt = messages.tilt_of(message, now.unix_s or 0.0)
-            return [] if tilt is None else self._receive_tilt(tilt, now)
-        if kind == topics.TRAILS:
-            return session.receive_trails(message, now)
-        if kind == topics.NAV_SAT_FIX:
-            return session.receive_gnss(message, now)
         if kind == topics.CAPTURE:
             messages.receive_capture(message)
             return []
-        return session.receive_camera(message, now)
-
-    def _receive_tilt(self, message: Any, now: Now) -> list[Output]:
-        self._tilts += 1
-        return self.session.receive_tilt(message, Sent(self._tilts), now)
+        if kind == topics.IMU:
+            kind, message = topics.TILT, messages.tilt_of(message, now.unix_s or 0.0)
+        return [] if message is None else session.receive(kind, message, now)
 
     def _ended(self, now: Now) -> Iterator[Output]:
         yield from self.session.end(now)
@@ -143,7 +125,6 @@ class Replay:
 
 
 def _tilt_message(log: TiltLog, k: int) -> Reading:
-    """The message of a reading."""
     z, variance_z = (math.nan if c is None else float(c[k]) for c in (log.theta_z, log.variance_z))
     return Reading(
         stamp_ns=round(float(log.utc_unix_s[k]) * 1e9),

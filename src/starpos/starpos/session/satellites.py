@@ -48,7 +48,6 @@ class LiveSatellites:
     def __init__(self, settings: Settings, orbits: StoredOrbits, jobs: Jobs, heard: Heard) -> None:
         self._settings, self._orbits, self._jobs, self._heard = settings, orbits, jobs, heard
         self._catalogue = catalogue.load_catalogue()
-        self._era = 0
         self.forget()
 
     def forget(self) -> None:
@@ -61,18 +60,11 @@ class LiveSatellites:
         self._made: list[Output] = []
         self._place: Place | None = None
         self._taught = 0
-        # a job begun before is out of date
-        self._era += 1
-
-    @property
-    def busy(self) -> bool:
-        """Whether a place is being computed."""
-        return self._jobs.busy
+        self._jobs.disown()
 
     # what comes -------------------------------------------------------------------------------------------------------
 
     def receive(self, message: Any) -> None:
-        """Take a TrailArray."""
         with refusing(self._heard, "trails"):
             stamp = message.header.stamp
             self._found[_ns(stamp)] = stamp, message_to_trails(message)
@@ -101,7 +93,7 @@ class LiveSatellites:
         return made
 
     def _begin(self) -> None:
-        era, frames, trails, values = self._era, tuple(self._waiting), self._trails, self._settings.values
+        frames, trails, values = tuple(self._waiting), self._trails, self._settings.values
         self._waiting.clear()
         instrument = self._settings.instrument(None)
         # an error of the stamps may be the same in all frames
@@ -111,17 +103,11 @@ class LiveSatellites:
         )
         prior = KnownBefore.at_height(values["altitude"], values["altitude_stddev"], clock_s)
         window_s = values["satellites.window"]
-        coming = self._jobs.run(
-            lambda: located(frames, trails, self._orbits, self._catalogue, prior, window_s)
+        self._jobs.run(
+            lambda: located(frames, trails, self._orbits, self._catalogue, prior, window_s),
+            # a defect loses these frames' trails
+            lambda o: self._take(o.value or Located(stamp=frames[-1][0], trails=trails, why=o.trouble)),
         )
-
-        def done(_: object) -> None:
-            outcome = coming.result()
-            if era == self._era:
-                # a defect loses these frames' trails
-                self._take(outcome.value or Located(stamp=frames[-1][0], trails=trails, why=outcome.trouble))
-
-        coming.add_done_callback(done)
 
     def _take(self, found: Located) -> None:
         self._newest, self._trails = found, found.trails

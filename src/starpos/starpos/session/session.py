@@ -28,6 +28,7 @@ from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
+from starpos.recording.topics import ALL_INPUTS, CAMERA_INFO, NAV_SAT_FIX, STARS, TILT, TRAILS
 from starpos.session import reports
 from starpos.session.calibrating import Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
@@ -46,6 +47,8 @@ if TYPE_CHECKING:
     from starpos.session.satellites import LiveSatellites
 
 T = TypeVar("T")
+# what takes a message; it may return answers
+Take = Callable[[Any, Now, Sent], list[Output] | None]
 NOTHING_TOLD = Sent()
 J2000_UNIX_S = 946_728_000.0
 # A stamp further in the future than AHEAD_S and this many stated sigmas is wrong.
@@ -76,13 +79,20 @@ class SolverSession:
         arrived_stars: Callable[[], Iterable[tuple[Any, Sent]]] = tuple,
         topic: str = CAMERA_TOPIC,
     ) -> None:
+        # the runners whose outcomes answers depend on
+        self._jobs: list[Jobs] = []
+
+        def waited_for() -> Jobs:
+            self._jobs.append(jobs())
+            return self._jobs[-1]
+
         self.latest: Waiting | None = None
         self.answer: Solution | None = None
         self.pace = Pace()
         # whether another frame can be answered at once, live: whoever drives the session calls `at` again, so that
         # messages that arrived meanwhile are taken first
         self.more = False
-        self.tilts = TiltBuffer()
+        self.tilts = TiltBuffer(settings)
         self.doubt = ClockDoubt()
         self._level = LevelDoubt()
         self.gyro = Gyro(heard)
@@ -90,12 +100,21 @@ class SolverSession:
         if settings.orbits is not None:
             from starpos.session import satellites
 
-            self.satellites = satellites.LiveSatellites(settings, settings.orbits, jobs(), heard)
+            self.satellites = satellites.LiveSatellites(settings, settings.orbits, waited_for(), heard)
         self.gnss: GnssTeacher | None = None
         if settings.values["gnss.use"]:
             self.gnss = GnssTeacher(settings, jobs(), heard, log, self.satellites)
+        self._take: dict[str, Take] = {
+            CAMERA_INFO: self._take_camera,
+            TILT: self._take_tilt,
+            STARS: self._take_stars,
+        }
+        if (gnss := self.gnss) is not None:
+            self._take[NAV_SAT_FIX] = lambda message, now, sent: gnss.receive(message, now)
+        if (by_trails := self.satellites) is not None:
+            self._take[TRAILS] = lambda message, now, sent: by_trails.receive(message)
         self.places = SessionPlaces(settings, self.gnss, self.satellites)
-        self.deflection = LiveDeflection(settings, jobs())
+        self.deflection = LiveDeflection(settings, waited_for())
         self._search = Search(settings.values)
         self._glows = Glows()
         self._settings, self._values = settings, settings.values
@@ -113,12 +132,12 @@ class SolverSession:
         self.instrument = CameraSolver(
             self._make_solver,
             self._other_camera,
-            jobs(),
+            waited_for(),
             lambda why: self._changes.say(why, good=False),
             topic,
         )
         self.calibrating = Calibrating(
-            settings, jobs(), lambda: self.instrument.solver_now, self._other_calibration, log
+            settings, waited_for(), lambda: self.instrument.solver_now, self._other_calibration, log
         )
         if unnamed := unnamed_inclinometer(settings.instrument(None), MODEL_BY_PARAMETERS):
             log.warning(unnamed)
@@ -131,17 +150,26 @@ class SolverSession:
         self.instrument.remake()
 
     def _other_camera(self) -> None:
-        self._hint = None
+        self._forget()
         self._search.other_camera()
         self._glows = Glows()
         self._level.clear()
-        self.gyro.forget()
         if self.gnss is not None:
             self.gnss.other_camera()
         self.calibrating.camera_changed()
+
+    def _forget(self) -> None:
+        """Forget what is known by the camera's pose."""
+        self._hint = None
+        self.gyro.forget()
         if self.satellites is not None:
             self.satellites.forget()
         self.deflection.forget()
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        """The types of the messages that it takes by the relative names of their topics."""
+        return {name: kind for name, kind in ALL_INPUTS.items() if kind in self._take}
 
     @property
     def waits(self) -> bool:
@@ -151,8 +179,7 @@ class SolverSession:
     @property
     def busy(self) -> bool:
         """Whether a job runs: what comes meanwhile may be answered with its outcome, or without."""
-        located = self.satellites is not None and self.satellites.busy
-        return located or self.instrument.preparing or self.calibrating.busy or self.deflection.busy
+        return any(jobs.busy for jobs in self._jobs)
 
     # parameters ------------------------------------------------------------------------------------------------------
 
@@ -168,34 +195,30 @@ class SolverSession:
 
     # inputs ----------------------------------------------------------------------------------------------------------
 
-    def receive_camera(self, message: Any, now: Now) -> list[Output]:
-        """Take a CameraInfo.
+    def receive(self, kind: str, message: Any, now: Now, sent: Sent = NOTHING_TOLD) -> list[Output]:
+        """Take a message of a type of `inputs`.
 
-        Another camera's counts from now on; in recorded data from its stamp on, since it may be read before frames that
+        Another camera counts from now on; in recorded data from its stamp on, since it may be read before frames that
         were taken before it.
         """
         made = self._begun(now)
+        made += self._take[kind](message, now, sent) or []
+        return made + self._work(now)
+
+    def _take_camera(self, message: Any, now: Now, sent: Sent) -> None:
         with refusing(self._heard, "camera_info"):
             self.instrument.receive(message, at_once=not now.played)
-        return made + self._work(now)
 
-    def receive_tilt(self, message: Any, sent: Sent, now: Now) -> list[Output]:
-        """Take a Tilt."""
-        made = self._begun(now)
-        self._receive_tilt(message, sent, now)
-        return made + self._work(now)
-
-    def _receive_tilt(self, message: Any, sent: Sent, now: Now) -> None:
+    def _take_tilt(self, message: Any, now: Now, sent: Sent) -> None:
         with refusing(self._heard, "tilt"):
-            self.tilts.receive(message, sent, now, self._settings.tilt_stddev_rad)
+            self.tilts.receive(message, sent, now)
 
-    def receive_stars(self, message: Any, now: Now, sent: Sent = NOTHING_TOLD) -> list[Output]:
+    def _take_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
         """Take a StarArray, and those that have come after it."""
-        made = self._begun(now)
-        made += self._add_stars(message, now, sent)
+        made = self._add_stars(message, now, sent)
         for later, later_sent in self._arrived_stars():
             made += self._add_stars(later, now, later_sent)
-        return made + self._work(now)
+        return made
 
     def _add_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
         """Have a frame wait for its tilts, if there is room; return a bad one's answer."""
@@ -248,22 +271,9 @@ class SolverSession:
 
     def _delay_s(self, now: Now) -> float:
         """For how long frames wait for their tilts, by the tilts that have come, and by the first frame."""
-        if not self._backlog or self._ready(self._backlog.first, now):
+        if not self._backlog or self._ready(self._backlog[0], now):
             return self.tilts.delay_s
-        return max(self.tilts.delay_s, now.waiting_s - self._backlog.first.since_s)
-
-    def receive_gnss(self, message: Any, now: Now) -> list[Output]:
-        """Take a sensor_msgs/NavSatFix of GNSS; nothing is done with it without gnss.use."""
-        if self.gnss is not None:
-            self.gnss.receive(message, now)
-        return self.at(now)
-
-    def receive_trails(self, message: Any, now: Now) -> list[Output]:
-        """Take a TrailArray; nothing is done with it without satellites.elements."""
-        made = self._begun(now)
-        if self.satellites is not None:
-            self.satellites.receive(message)
-        return made + self._work(now)
+        return max(self.tilts.delay_s, now.waiting_s - self._backlog[0].since_s)
 
     def at(self, now: Now) -> list[Output]:
         """Go on to a time."""
@@ -293,7 +303,7 @@ class SolverSession:
         if now.unix_s > was_s:
             for message in self.tilts.pop_early():
                 with refusing(self._heard, "tilt"):
-                    self.tilts.keep_in_time(message, now, self._settings.tilt_stddev_rad)
+                    self.tilts.keep_in_time(message, now)
 
     def _work(self, now: Now) -> list[Output]:
         """Answer what can be answered, and have the trails of these frames looked at."""
@@ -311,39 +321,31 @@ class SolverSession:
                 return made
             # After a stall the frame's own tilts may be among them.
             for message, sent in self._arrived():
-                self._receive_tilt(message, sent, now)
-            made += self._solve(self._backlog.pop(now.waiting_s).dated(now), now)
+                self._take_tilt(message, now, sent)
+            made += self._solve(self._backlog.take(now.waiting_s).dated(now), now)
         self._backlog.pause()
         return made
 
     def _first_ready(self, now: Now) -> bool:
         if self._backlog:
-            self.instrument.advance_to(self._backlog.first.stars.mid_unix_s)
-        return bool(self._backlog) and self._ready(self._backlog.first, now)
+            self.instrument.advance_to(self._backlog[0].stars.mid_unix_s)
+        return bool(self._backlog) and self._ready(self._backlog[0], now)
 
     def _ready(self, frame: Waiting, now: Now) -> bool:
         if self.instrument.preparing:
             return False
         if math.isnan(frame.since_s):
-            frame = self._backlog.first = replace(frame, since_s=now.waiting_s)
+            frame = self._backlog[0] = replace(frame, since_s=now.waiting_s)
         mid, waited_s = frame.stars.mid_unix_s, now.waiting_s - frame.since_s
         # a negative wait: the clock has begun anew
-        if (
-            mid is None
-            or self._ended
-            or waited_s > self.tilts.patience_s(self._values["tilt_timeout"])
-            or waited_s < 0
-        ):
+        if mid is None or self._ended or waited_s > self.tilts.patience_s or waited_s < 0:
             return True
         if self.instrument.solver is None:
             return bool(self.instrument.trouble)
         # an instrument at a known place may have no inclinometer
         if self.places.known and not len(self.tilts):
             return True
-        return self.tilts.complete(mid, self._span(frame.stars))
-
-    def _span(self, stars: Stars) -> float:
-        return stars.exposure_s or self._values["tilt_window"]
+        return self.tilts.complete(mid, frame.stars.exposure_s or 0.0)
 
     def _solve(self, frame: Waiting, now: Now) -> list[Output]:
         predicted: Priors = self._guarded(
@@ -386,9 +388,7 @@ class SolverSession:
         # a node has no picture to look at, only the list
         stars = frame.stars
         places = self.places if self.places.known else None
-        return Question(
-            item=stars, stars=stars, tilts=self.tilts.over(self._span(stars)), places=places, **known
-        )
+        return Question(item=stars, stars=stars, tilts=self.tilts, places=places, **known)
 
     def _answer(self, frame: Waiting, question: Question) -> Solution:
         def work() -> Solution:
@@ -455,7 +455,7 @@ class SolverSession:
         if answer.status is Status.BAD_INPUT and frame.ahead_s > reports.AHEAD_S:
             return []
         try:
-            tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, self._span(stars))
+            tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
             solver.instrument.inclinometer.check_live(tilt)
         except StarposError:
             return []
@@ -494,16 +494,13 @@ class SolverSession:
         """Forget tilts, frames and the place, but no calibration that was found."""
         self.tilts.clear()
         self._backlog.clear()
-        self.latest = self.answer = self._hint = None
-        self.gyro.forget()
+        self.latest = self.answer = None
+        self._forget()
         if self.gnss is not None:
             self.gnss.places.forget()
-        if self.satellites is not None:
-            self.satellites.forget()
         self.doubt.clear()
         self._level.clear()
         self.calibrating.forget()
-        self.deflection.forget()
 
 
 def _failed(frame: Waiting, what: str, error: Exception) -> Solution:

@@ -22,6 +22,7 @@ from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK, UNUSABLE, message_to_tilt
 from starpos.session import reports
 from starpos.session.driver import Now, Sent, name_in
+from starpos.session.settings import Settings
 
 # Number of samples from which the noise is measured.
 STEPS_KEPT = 2000
@@ -163,9 +164,22 @@ MAX_EARLY = 1000
 
 
 class TiltBuffer:
-    """Keeps the latest samples, in any order; keeps unusable ones only to explain a missing tilt."""
+    """Keeps the latest samples, in any order; keeps unusable ones only to explain a missing tilt.
 
-    def __init__(self) -> None:
+    An exposure of 0 is not known: samples of tilt_window count in its place.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        # of the last message; '' before the first one
+        self.frame_id = ""
+        self.clear()
+
+    def __len__(self) -> int:
+        return len(self._good)
+
+    def clear(self) -> None:
+        """Forget all samples, and who has published them."""
         # Each with the number of its arrival.
         self._good: deque[tuple[int, Tilt]] = deque(maxlen=CAPACITY)
         self._came, self._latest_unix_s = 0, -np.inf
@@ -174,23 +188,8 @@ class TiltBuffer:
         # how late each of the newest came, and the time between it and the one before
         self._late_s: deque[float] = deque(maxlen=USUAL)
         self._apart_s: deque[float] = deque(maxlen=USUAL)
-        self._publishers = TiltPublishers()
         # those ahead of a clock that may have been heard only after them
         self._early: deque[Any] = deque(maxlen=MAX_EARLY)
-        # of the last message; '' before the first one
-        self.frame_id = ""
-
-    def __len__(self) -> int:
-        return len(self._good)
-
-    def clear(self) -> None:
-        self._good.clear()
-        self._flagged.clear()
-        self._steps.clear()
-        self._late_s.clear()
-        self._apart_s.clear()
-        self._early.clear()
-        self._latest_unix_s = -np.inf
         self.forget_publishers()
 
     def forget_publishers(self) -> None:
@@ -202,7 +201,7 @@ class TiltBuffer:
         """Whether a tilt waits for its time."""
         return bool(self._early)
 
-    def receive(self, message: Any, sent: Sent, now: Now, unknown_stddev_rad: float) -> None:
+    def receive(self, message: Any, sent: Sent, now: Now) -> None:
         """Keep a Tilt, or have one of recorded data that is ahead of a clock heard late wait for `pop_early`.
 
         TiltError if it is broken or of the future, and while two publish: it is unknown which samples are the
@@ -219,7 +218,7 @@ class TiltBuffer:
         if now.played and now.ahead_s(stamp_to_unix(message.header.stamp)) > reports.AHEAD_S:
             self._early.append(message)
         else:
-            self.keep_in_time(message, now, unknown_stddev_rad)
+            self.keep_in_time(message, now)
 
     def pop_early(self) -> list[Any]:
         """The messages that waited for their time; none waits any more."""
@@ -227,20 +226,20 @@ class TiltBuffer:
         self._early.clear()
         return early
 
-    def keep_in_time(self, message: Any, now: Now, unknown_stddev_rad: float) -> None:
+    def keep_in_time(self, message: Any, now: Now) -> None:
         """Keep a Tilt, unless it is of the future: the instrument may lean otherwise when its time comes."""
         if (ahead_s := now.ahead_s(stamp_to_unix(message.header.stamp))) > reports.AHEAD_S:
             raise TiltError(f"a tilt is stamped {ahead_s:.3g} s in the future: {reports.ONE_CLOCK}")
-        self.keep(message, unknown_stddev_rad)
+        self.keep(message)
         self._late_s.append(max(-ahead_s, 0.0))
         self.frame_id = name_in(message)
 
-    def keep(self, message: Any, unknown_stddev_rad: float) -> None:
+    def keep(self, message: Any) -> None:
         """Keep a sample; TiltError if the message is broken."""
         if message.flags & UNUSABLE:
             self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, message.flags))
             return
-        sample = message_to_tilt(message, unknown_stddev_rad)
+        sample = message_to_tilt(message, self._settings.tilt_stddev_rad)
         if self._good:
             before = self._good[-1][1]
             self._steps.record(before, sample)
@@ -266,12 +265,15 @@ class TiltBuffer:
         late_s, apart_s = max(self._late_s), float(np.median(self._apart_s))
         return late_s + apart_s if late_s < LATEST_S and apart_s < tilt_log.BRACKET_S else 0.0
 
-    def patience_s(self, stated_s: float) -> float:
-        """How long a frame waits for its tilts, s; a stated NaN: by the tilts' own delay."""
+    @property
+    def patience_s(self) -> float:
+        """How long a frame waits for its tilts, s: as tilt_timeout says, or by the tilts' own delay."""
+        stated_s: float = self._settings.values["tilt_timeout"]
         return max(PATIENCE_S, DELAYS * self.delay_s) if math.isnan(stated_s) else stated_s
 
-    def complete(self, mid_unix_s: float, span_s: float) -> bool:
+    def complete(self, mid_unix_s: float, exposure_s: float) -> bool:
         """Whether all samples that an exposure needs have arrived: none that may still come lies in it or bounds it."""
+        span_s = exposure_s or self._settings.values["tilt_window"]
         times = [s.utc_unix_s for s in self._near(mid_unix_s, span_s)]
         end = mid_unix_s + span_s / 2
         if not times or times[-1] >= end:
@@ -299,8 +301,9 @@ class TiltBuffer:
                 last = came
         return [near[t] for t in sorted(near)]
 
-    def average(self, mid_unix_s: float, span_s: float) -> Tilt:
+    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """Average over an exposure; TiltRangeError or TiltError with the reason if it is impossible."""
+        span_s = exposure_s or self._settings.values["tilt_window"]
         if several := self._publishers.several:
             raise TiltError(several)
         near = self._near(mid_unix_s, span_s)
@@ -338,10 +341,6 @@ class TiltBuffer:
         theta = np.array([s.theta[:2] for s in used])
         return tilt_log.coarse_step(theta, tilt_log.without_copies(moves), repeats, noise)
 
-    def over(self, span_s: float) -> "tilt_log.Tilts":
-        """These tilts for a frame, over a span in place of an exposure that may not be known."""
-        return _Over(self, span_s)
-
     def _explain(self, mid_unix_s: float, span_s: float, others_near: bool) -> None:
         """Raise the reason why no sample lies in an exposure; return if others that are near it may bracket it."""
         flags = 0
@@ -363,15 +362,3 @@ class TiltBuffer:
         nearest = min((abs(s.utc_unix_s - mid_unix_s) for _, s in self._good), default=None)
         known = "none has arrived at all" if nearest is None else f"the nearest is {nearest:.1f} s off"
         raise TiltError(f"tilt: no sample near the exposure ({known}): check the inclinometer and the clocks")
-
-
-@dataclass(frozen=True)
-class _Over:
-    """The tilts of a TiltBuffer over a span."""
-
-    buffer: TiltBuffer
-    span_s: float
-
-    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
-        """Average over the span about a time."""
-        return self.buffer.average(mid_unix_s, self.span_s)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import fdtri
 
-from starpos.averaging.altitudes import f_quantile, place_of_circles
+from starpos.averaging.altitudes import WITHIN, excess, place_of_circles
 from starpos.earth.orientation import earth_state
 from starpos.errors import FixError
 from starpos.fix.circle import circle_of
@@ -35,8 +35,9 @@ def near_of(night):
 
 
 @pytest.mark.parametrize("free", [2, 3, 7, 60])
-def test_quantiles_are_those_of_scipy(free):
-    assert f_quantile(free, 0.95) == pytest.approx(fdtri(2, free, 0.95), rel=1e-12)
+def test_scatter_widens_by_the_f_distribution_of_scipy(free):
+    wide = fdtri(2, max(free, 2), WITHIN) / -np.log(1 - WITHIN)
+    assert excess(3.0 * free, free) == pytest.approx(2 * wide, rel=1e-12)
 
 
 def test_exact_elevations_give_the_exact_place(rng):

@@ -64,13 +64,13 @@ def readings(rng, headings, noise=SCA100T, lean=0.0, wander=0.0, leans=None) -> 
         utc_unix_s=60.0 * np.arange(n),
         to_camera=np.array(to_camera),
         plumb=rows,
-        heading=np.radians(headings),
         sigma=np.full(n, noise),
         common2=np.zeros(n),
         pose=np.arange(n),
         pose_sigma=0.0,
         columns=shared,
         column_sigma=np.repeat([1.0, KNOWN], [4, 5]),
+        axes=2,
     )
     return made, Truth(a3, zenith, given)
 

@@ -53,12 +53,8 @@ class Answering:
     def __init__(self, *answers):
         self.answers, self.ways = iter(answers), []
 
-    def identify(self, stars, predicted=(), part=1.0):
-        self.ways.append(("search", stars.source, part))
-        return next(self.answers)
-
-    def look_again(self, stars, look, predicted=(), part=1.0):
-        self.ways.append(("look", stars.source, part))
+    def identify(self, stars, predicted=(), part=1.0, look=None):
+        self.ways.append(("look" if look else "search", stars.source, part))
         return next(self.answers)
 
     def solve(self, stars, tilts, hint=None, predicted=(), known=None):

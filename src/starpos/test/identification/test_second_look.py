@@ -47,7 +47,7 @@ def answers(solver, catalogue, frames, rng, **more):
         stars = detect(frame).stars
         alone = solver.identify(stars)
         look = SecondLook(frame, stars.window, stars.fwhm_px)
-        yield attitude, alone, alone if alone.ok else solver.look_again(stars, look)
+        yield attitude, alone, alone if alone.ok else solver.identify(stars, look=look)
 
 
 def is_right(solution, attitude):

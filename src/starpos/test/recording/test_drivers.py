@@ -2,6 +2,7 @@
 """Which topics of a robot's bag are its images, intrinsics and accelerations."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 
@@ -23,7 +24,8 @@ class Topic:
 
 
 def found(*topics, remaps=(), namespace=None):
-    return driver_topics([Topic(*t) for t in topics], remaps_of(remaps), namespace)
+    bag = SimpleNamespace(path="the bag", connections=[Topic(*t) for t in topics])
+    return driver_topics(bag, remaps_of(remaps), namespace)
 
 
 ONE = (("/cam0/image_raw", IMAGE), ("/cam0/camera_info", INFO), ("/imu/data", IMU))

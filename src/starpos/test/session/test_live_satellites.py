@@ -76,5 +76,5 @@ def test_a_trail_that_cannot_be_is_refused(live, changes):
     assert name == "trails" and "impossible" in sentence
     live.receive(SimpleNamespace(header=header, trails=[trail()]))
     # its stars have not come: nothing to look at
-    assert live.fetch() == [] and not live.busy
+    assert live.fetch() == [] and not live._jobs.busy
     assert live.report().level is Level.WARN

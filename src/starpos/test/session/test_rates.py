@@ -48,9 +48,8 @@ class Core:
         self.queues, self.answers = {STARS: [], TILT: []}, {}
 
     def answer(self, frame):
-        tilts = self.session.tilts.over(EXPOSURE_S)
         try:
-            tilts.average(frame.stars.mid_unix_s, EXPOSURE_S)
+            self.session.tilts.average(frame.stars.mid_unix_s, EXPOSURE_S)
         except Exception as e:
             return Solution.failed(frame.stars, Status.NO_TILT, str(e))
         return Solution.failed(frame.stars, Status.NOT_IDENTIFIED, "not looked for")

@@ -14,7 +14,8 @@ import pytest
 
 from starpos.fix.solution import Status
 from starpos.instrument.instrument import Calibration
-from starpos.session.driver import JobsInTurn, Now, Sent
+from starpos.recording.topics import CAMERA_INFO, STARS, TILT
+from starpos.session.driver import JobsInTurn, Now
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings
 from starpos_testing.skies.scenes import (
@@ -93,14 +94,14 @@ def told(scene, stars, tilt, **parameters):
         k=[camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0], binning_x=0, binning_y=0,
         roi=SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0),
     )  # fmt: skip
-    session.receive_camera(info, now)
+    session.receive(CAMERA_INFO, info, now)
     for each in jobs:
         each.work()
     message = SimpleNamespace(
         header=header(tilt.utc_unix_s), x=tilt.theta_x, y=tilt.theta_y, z=np.nan, z_variance=np.nan,
         covariance=tilt.covariance.ravel(), temperature=15.0, flags=0,
     )  # fmt: skip
-    session.receive_tilt(message, Sent(1), now)
+    session.receive(TILT, message, now)
     seen = [
         SimpleNamespace(x=x, y=y, flux=flux, snr=snr, covariance=c.ravel(), flags=flag)
         for x, y, flux, snr, c, flag in zip(
@@ -111,7 +112,7 @@ def told(scene, stars, tilt, **parameters):
         header=header(START + EXPOSURE / 2), width=SIZE[0], height=SIZE[1], exposure=EXPOSURE, stamp_stddev=0.0,
         clock_stddev=0.0, shutter_known=True, readout=0.0, readout_stddev=0.0, stars=seen,
     )  # fmt: skip
-    answers = session.receive_stars(array, now) + session.end(Now(START + 2.0, 1.5))
+    answers = session.receive(STARS, array, now) + session.end(Now(START + 2.0, 1.5))
     return answers[0].solution
 
 

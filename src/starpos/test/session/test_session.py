@@ -15,7 +15,7 @@ from starpos.errors import InstrumentError
 from starpos.fix.solution import Status
 from starpos.messages.stamp import stamp_to_unix
 from starpos.recording.bag import BagReader
-from starpos.recording.topics import CAMERA_INFO, INPUTS, STARS, TILT, instrument_in
+from starpos.recording.topics import CAMERA_INFO, INPUTS, NAV_SAT_FIX, STARS, TILT, instrument_in
 from starpos.session import reports
 from starpos.session.driver import Answered, JobsInTurn, Level, Now, Sent
 from starpos.session.replay import Replay
@@ -70,9 +70,7 @@ class Told:
 
     def tell(self, kind, message, at_s, played=True, sent=NOTHING_TOLD):
         now = Now.in_data(at_s) if played else Now(at_s, at_s)
-        if kind == TILT:
-            return self.session.receive_tilt(message, sent, now)
-        return (self.session.receive_stars if kind == STARS else self.session.receive_camera)(message, now)
+        return self.session.receive(kind, message, now, sent)
 
     def at(self, at_s):
         return self.session.at(Now.in_data(at_s))
@@ -331,7 +329,7 @@ def test_half_a_site_is_refused():
 def test_the_place_of_a_heading_may_be_that_of_gnss(messages, begin_s):
     told = seen_at(messages, begin_s, "gnss.use:=true")
     stars, came_s = first(messages, STARS)
-    told.session.receive_gnss(gnss_fix(stars), Now.in_data(came_s))
+    told.session.receive(NAV_SAT_FIX, gnss_fix(stars), Now.in_data(came_s))
     [answer] = told.tell(STARS, stars, came_s)
     at_place = answer.solution.at_place
     assert math.degrees(at_place.ellipsoid.heading) == pytest.approx(195.31952, abs=2e-3)
@@ -346,28 +344,18 @@ def test_the_place_of_a_heading_may_be_that_of_gnss(messages, begin_s):
 def test_gnss_without_a_fix_is_no_place(messages, begin_s):
     told = seen_at(messages, begin_s, "gnss.use:=true")
     stars, came_s = first(messages, STARS)
-    told.session.receive_gnss(gnss_fix(stars, latitude=float("nan")), Now.in_data(came_s))
+    told.session.receive(NAV_SAT_FIX, gnss_fix(stars, latitude=float("nan")), Now.in_data(came_s))
     lost = gnss_fix(stars)
     lost.status = SimpleNamespace(status=-1)
-    told.session.receive_gnss(lost, Now.in_data(came_s))
+    told.session.receive(NAV_SAT_FIX, lost, Now.in_data(came_s))
     [answer] = told.tell(STARS, stars, came_s)
     assert answer.solution.at_place is None
 
 
-def test_without_gnss_use_messages_of_gnss_change_no_answer(messages, begin_s):
-    stars, came_s = first(messages, STARS)
-    answers = []
-    for given in (False, True):
-        told = seen_at(messages, begin_s)
-        for tilt, _ in tilts_of(messages, came_s + 5.0):
-            told.tell(TILT, tilt, came_s)
-        if given:
-            told.session.receive_gnss(gnss_fix(stars, latitude=10.0), Now.in_data(came_s))
-        [answer, *_] = told.tell(STARS, stars, came_s)
-        assert answer.solution.ok and answer.compared is None
-        fix = answer.solution.fix
-        answers.append((fix.latitude, fix.longitude, fix.covariance.tobytes(), answer.ground.latitude))
-    assert answers[0] == answers[1] and told.session.gnss is None
+def test_gnss_is_an_input_with_gnss_use_alone():
+    without = Told().session
+    assert without.inputs == INPUTS and without.gnss is None
+    assert Told("gnss.use:=true").session.inputs == INPUTS | {"gnss/fix": NAV_SAT_FIX}
 
 
 @pytest.mark.parametrize(

@@ -43,10 +43,14 @@ def sample(
     )
 
 
+def new_buffer() -> TiltBuffer:
+    return TiltBuffer(SimpleNamespace(tilt_stddev_rad=NOISE, values={"tilt_window": 0.5}))
+
+
 def buffer_of(messages) -> TiltBuffer:
-    buffer = TiltBuffer()
+    buffer = new_buffer()
     for message in messages:
-        buffer.keep(message, NOISE)
+        buffer.keep(message)
     return buffer
 
 
@@ -107,14 +111,14 @@ def test_a_cleared_buffer_measures_the_noise_as_a_new_one():
     buffer = buffer_of([*noisy, sample(60.0)])
     buffer.clear()
     for message in noisy:
-        buffer.keep(message, NOISE)
+        buffer.keep(message)
     assert np.array_equal(buffer.average(T0, 0.5).covariance, buffer_of(noisy).average(T0, 0.5).covariance)
 
 
 def test_a_night_that_is_played_again_measures_the_same_noise():
     """Three exposures of few samples show nothing; with both times counted they showed noise that is not there."""
     rng = np.random.default_rng(5)
-    buffer, shots = TiltBuffer(), [0.0, 3.0, 6.0]
+    buffer, shots = new_buffer(), [0.0, 3.0, 6.0]
     night = [
         [sample(t + k / 10, *([1, -2] + 2.5 * np.degrees(NOISE) * rng.normal(size=2))) for k in range(-2, 3)]
         for t in shots
@@ -123,7 +127,7 @@ def test_a_night_that_is_played_again_measures_the_same_noise():
     def played():
         for t, messages in zip(shots, night, strict=True):
             for message in messages:
-                buffer.keep(message, NOISE)
+                buffer.keep(message)
             yield buffer.average(T0 + t, 0.5).covariance
 
     first = list(played())
@@ -174,29 +178,29 @@ def test_nothing_near_says_how_far_the_nearest_is():
     with pytest.raises(TiltError, match=r"60\.0 s off"):
         buffer_of([sample(60.0)]).average(T0, 0.5)
     with pytest.raises(TiltError, match="none has arrived"):
-        TiltBuffer().average(T0, 0.5)
+        new_buffer().average(T0, 0.5)
 
 
 def test_broken_samples_are_refused_and_not_kept():
-    buffer = TiltBuffer()
+    buffer = new_buffer()
     impossible = sample(0.0, 60.0, 60.0)
     for broken in (sample(0.0, math.nan), sample(0.0, variance=-1.0), sample(-T0), impossible):
         with pytest.raises(TiltError):
-            buffer.keep(broken, NOISE)
+            buffer.keep(broken)
     assert len(buffer) == 0
 
 
 def test_complete_once_a_sample_of_the_exposures_end_is_here():
     buffer = buffer_of(sample(k / 10) for k in range(-5, 1))
     assert not buffer.complete(T0, 0.5)
-    buffer.keep(sample(0.2), NOISE)
+    buffer.keep(sample(0.2))
     assert buffer.complete(T0, 0.5)
 
 
 def test_the_sample_after_an_exposure_is_waited_for_where_the_last_one_in_it_leaves_its_end_open():
     buffer = buffer_of(sample(k - 0.2) for k in range(-3, 1))
     assert not buffer.complete(T0, 0.5)
-    buffer.keep(sample(0.8, 5.0), NOISE)
+    buffer.keep(sample(0.8, 5.0))
     assert buffer.complete(T0, 0.5)
     with pytest.raises(TiltError, match="uncovered"):
         buffer.average(T0, 0.5)

@@ -145,7 +145,8 @@ ANSWERS = {
     ),
     "fix": lambda solver, stars, found, tilt: solver.solve(stars, tilt).fix,
     "under way": lambda solver, stars, found, tilt: (
-        sighting_of(stars, solver, found).under(Site(*PLACE).enu[2], VACUUM).rotation.T @ Site(*PLACE).enu.T
+        sighting_of(stars, solver, found).under(Site(*PLACE).enu[2], VACUUM)[0].rotation.T
+        @ Site(*PLACE).enu.T
     ),
 }
 

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Which meridians and parallels a view shows, from the whole Earth to hundredths of an arcsecond.
 
+import { parts } from "/text.js";
+
 const SECOND = 1 / 3600;
 const STEPS = [30, 15, 10, 5, 2, 1, ...[30, 20, 10, 5, 2, 1].map((m) => m / 60)].concat(
   [30, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001].map((s) => s * SECOND),
@@ -41,14 +43,8 @@ export function graticule(view, corner) {
 // A line's name, as fine as its step.
 export function label(degrees, step, signs) {
   const turned = signs === "EW" ? ((((degrees + 180) % 360) + 360) % 360) - 180 : degrees;
-  const units = 10000; // of an arcsecond
-  const exact = Math.round(Math.abs(turned) * 3600 * units);
-  const hemisphere = exact === 0 || exact === 180 * 3600 * units ? "" : turned < 0 ? signs[1] : signs[0];
+  const middle = Math.abs(Math.abs(turned) - 90) > 90 - 1e-9; // the equator, Greenwich or 180°
   const places = Math.max(0, Math.ceil(-Math.log10(step * 3600) - 1e-9));
-  const seconds = ((exact % (60 * units)) / units).toFixed(places);
-  const minutes = Math.floor(exact / (60 * units)) % 60;
-  let text = `${Math.floor(exact / (3600 * units))}°`;
-  if (step < 1 - 1e-9) text += `${String(minutes).padStart(2, "0")}′`;
-  if (step < 1 / 60 - 1e-9) text += `${seconds.padStart(places ? 3 + places : 2, "0")}″`;
-  return text + hemisphere;
+  const finest = [3600, 60].find((seconds) => step * 3600 > seconds - 1e-6) ?? 1;
+  return parts(turned, finest, places) + (middle ? "" : turned < 0 ? signs[1] : signs[0]);
 }

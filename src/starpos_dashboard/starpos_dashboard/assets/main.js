@@ -45,16 +45,21 @@ const heardAgo = (told) => told.age + elapsed();
 const stampAge = (told) => (told.stamp === null ? heardAgo(told) : state.now + elapsed() - told.stamp);
 
 // Of what comes with a frame: neither the message nor what it tells of may be old.
-const isOld = (told) => Math.max(heardAgo(told), stampAge(told)) > state.old_after.slow;
-const badge = (told, old) => (old ? `${text.age(Math.max(heardAgo(told), stampAge(told)))} old` : "");
+const oldness = (told) => Math.max(heardAgo(told), stampAge(told));
+const isOld = (told) => oldness(told) > state.old_after.slow || !link.alive;
+const fresh = (told) => (told && !isOld(told) ? told : null);
+
+function dressByAge(name, told, none) {
+  const old = Boolean(told) && isOld(told);
+  dress(name, told ? (old ? "old" : "") : "missing", told ? (old ? `${text.age(oldness(told))} old` : "") : none);
+}
 
 // the cards -----------------------------------------------------------------------------------------------------------
 
 function render() {
   const { fix } = state;
-  const old = Boolean(fix) && (isOld(fix) || !link.alive);
-  showStatus(fix, old);
-  showPosition(fix, old);
+  showStatus(fix);
+  showPosition(fix);
   showTime();
   showHeading();
   showTilt();
@@ -69,17 +74,18 @@ function render() {
   dressFrame();
 }
 
-function verdict(fix, old) {
-  const said = state.solution && !state.solution.good && !isOld(state.solution) ? state.solution.sentence : "";
+function verdict(fix) {
+  const solution = fresh(state.solution);
+  const said = solution && !solution.good ? solution.sentence : "";
   const solver = state.lights.find((l) => OWN_SOLUTION.test(l.name) && heardAgo(l) < state.old_after.fast);
   const why = said || (solver && solver.level > 0 ? solver.sentence : "");
   if (full) return ["lost", "No place", `${full} pages are open already, as many as the parameter clients allows`];
   if (!link.alive) return ["lost", "No connection", "the dashboard node is silent: what is shown is of the past"];
   if (!fix) return ["none", "No fix yet", why || "nothing has come on the topic fix"];
-  if (old && heardAgo(fix) <= state.old_after.slow) {
+  if (isOld(fix) && heardAgo(fix) <= state.old_after.slow) {
     return ["old", "Old fix", `it was taken ${text.age(stampAge(fix))} ago: a replay, or a clock that is wrong`];
   }
-  if (old) return ["old", "No fix now", why || `nothing has come on the topic fix for ${text.age(heardAgo(fix))}`];
+  if (isOld(fix)) return ["old", "No fix now", why || `nothing has come on the topic fix for ${text.age(heardAgo(fix))}`];
   if (!fix.good) return ["none", "No fix", why || fix.trouble];
   if (stampAge(fix) < -AHEAD_S) {
     return ["old", "Fix", `its time lies ${text.age(-stampAge(fix))} ahead of this machine's clock`];
@@ -89,12 +95,13 @@ function verdict(fix, old) {
 
 function summary(fix) {
   const { east, north } = sigmas(fix);
-  const stars = state.solution?.good && !isOld(state.solution) ? `, ${state.solution.stars_matched} stars` : "";
+  const solution = fresh(state.solution);
+  const stars = solution?.good ? `, ${solution.stars_matched} stars` : "";
   return `± ${text.metres(east)} east, ± ${text.metres(north)} north${stars}`;
 }
 
-function showStatus(fix, old) {
-  const [kind, word, sentence] = verdict(fix, old);
+function showStatus(fix) {
+  const [kind, word, sentence] = verdict(fix);
   element("status").className = kind;
   say("status-word", word);
   say("status-sentence", sentence);
@@ -108,11 +115,11 @@ function sigmas(fix) {
   return { east, north, latitude: north && north / degree, longitude: east && east / across };
 }
 
-function showPosition(fix, old) {
+function showPosition(fix) {
   const good = fix?.good ? fix : null;
   const s = sigmas(good);
   const last = good || state.last_fix || null;
-  dress("position-card", "position-age", good ? (old ? "old" : "") : "missing", good ? badge(good, old) : "no fix");
+  dressByAge("position", good, "no fix");
   say("latitude", text.sexagesimal(good?.latitude, "NS", s.latitude));
   say("longitude", text.sexagesimal(good?.longitude, "EW", s.longitude));
   say("sigma-east", good ? `± ${text.metres(s.east)}` : text.UNKNOWN);
@@ -120,19 +127,18 @@ function showPosition(fix, old) {
   say("altitude", text.metres(good?.altitude));
   say("decimal", good ? plain(good, s) : last ? `last fix ${plain(last, sigmas(last))}, ${text.age(stampAge(last))} ago` : "");
   offerPlace(good);
-  const average = state.averaged?.good && !isOld(state.averaged) && !old && good ? state.averaged : null;
+  const average = fresh(good) && fresh(state.averaged)?.good ? state.averaged : null;
   const a = sigmas(average);
   const both = ["latitude", "longitude"].map((n, i) => text.sexagesimal(average?.[n], ["NS", "EW"][i], a[n]));
   say("average", average ? both.join("  ") : text.UNKNOWN);
   say("average-sigma", average ? `± ${text.metres(a.east)} east, ± ${text.metres(a.north)} north` : "");
-  const heading = state.heading && !isOld(state.heading) && link.alive ? state.heading.azimuth : null;
-  const gnss = showGnss();
-  map?.show({ newest: last, average, gnss, old: old || !good, azimuth: heading, track });
+  const azimuth = fresh(state.heading)?.azimuth ?? null;
+  map?.show({ newest: last, average, gnss: showGnss(), old: !fresh(good), azimuth, track });
 }
 
 // The GNSS place of the newest frame, null without one, and what the guard says of it.
 function showGnss() {
-  const gnss = state.gnss && !isOld(state.gnss) && link.alive ? state.gnss : null;
+  const gnss = fresh(state.gnss);
   element("gnss").hidden = !gnss;
   if (!gnss) return null;
   element("gnss").dataset.status = gnss.status;
@@ -146,8 +152,8 @@ const plain = (fix, s) => `${text.decimal(fix.latitude, s.latitude)} ${text.deci
 
 function showTime() {
   const last = state.last_fix ?? null;
-  const solution = state.solution && !isOld(state.solution) && link.alive ? state.solution : null;
-  element("time-card").classList.toggle("old", !last || isOld(last) || !link.alive);
+  const solution = fresh(state.solution);
+  element("time-card").classList.toggle("old", !fresh(last));
   say("fix-time", text.utcTime(last?.stamp));
   say("fix-date", text.utcDate(last?.stamp));
   const age = last && stampAge(last);
@@ -159,8 +165,7 @@ function showTime() {
 
 function showHeading() {
   const { heading } = state;
-  const old = Boolean(heading) && (isOld(heading) || !link.alive);
-  dress("heading-card", "heading-age", !heading ? "missing" : old ? "old" : "", heading ? badge(heading, old) : "none");
+  dressByAge("heading", heading, "none");
   compass.show(heading);
   compass.showSun(state.sun);
   say("heading", text.azimuth(heading?.azimuth, heading?.sigma));
@@ -172,7 +177,7 @@ function showTilt() {
   const { tilt } = state;
   const old = Boolean(tilt) && (heardAgo(tilt) > state.old_after.fast || !link.alive);
   const missing = !tilt || tilt.x === null || tilt.y === null;
-  dress("tilt-card", "tilt-age", old ? "old" : missing ? "missing" : "", old ? `${text.age(heardAgo(tilt))} old` : "");
+  dress("tilt", old ? "old" : missing ? "missing" : "", old ? `${text.age(heardAgo(tilt))} old` : "");
   bubble.show(tilt);
   for (const axis of ["x", "y"]) {
     const sigma = tilt?.[`sigma_${axis}`];
@@ -185,8 +190,7 @@ function showTilt() {
 
 function showErrors() {
   const solution = state.solution?.good ? state.solution : null;
-  const old = Boolean(solution) && (isOld(solution) || !link.alive);
-  dress("budget-card", "budget-age", !solution ? "missing" : old ? "old" : "", solution ? badge(solution, old) : "none");
+  dressByAge("budget", solution, "none");
   showBudget(solution?.budget ?? []);
   say("budget-note", solution ? "plain: new in every frame; striped: stays, however long the average" : "");
 }
@@ -214,8 +218,8 @@ picture.addEventListener("error", () => (picture.hidden = true));
 
 function dressFrame() {
   const { frame } = state;
-  const old = Boolean(frame) && (isOld(frame) || !link.alive);
-  dress("frame-card", "frame-age", !wanted ? "" : !frame ? "missing" : old ? "old" : "", frame && wanted ? badge(frame, old) : "");
+  if (wanted) dressByAge("frame", frame, "");
+  else dress("frame", "", "");
   const waiting = "no frame yet: the detector draws the next one";
   say("frame-note", !wanted ? "hidden: the detector draws none for this page" : frame ? frame.trouble : waiting);
 }

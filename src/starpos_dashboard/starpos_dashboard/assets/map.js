@@ -6,7 +6,7 @@ import { add, element, say } from "/page.js";
 import { graticule, label } from "/graticule.js";
 import * as text from "/text.js";
 
-const { geoOrthographic, geoPath, geoDistance } = window.d3;
+const { geoOrthographic, geoPath, geoDistance, geoRotation } = window.d3;
 
 const EARTH_M = 6371008.8; // mean radius
 const NEAREST = 0.01; // m a pixel
@@ -94,34 +94,28 @@ export class EarthMap {
     const fix = this.data.newest;
     if (this.follow && fix) Object.assign(this.view, { lon: fix.longitude, lat: fix.latitude });
     const near = this.follow === "fix" && fix;
-    if (near) this.view.k = EARTH_M / Math.max(this._scaleOf(fix), this._scaleWithGnss(fix));
+    if (near) this.view.k = EARTH_M / Math.max(this._scaleOf(fix), this._scaleOf(fix, this.data.gnss));
     else if (this.follow === "earth" || (this.follow && !fix)) this.view.k = this._whole;
     this.view.k = Math.min(Math.max(this.view.k, this._whole * 0.8), EARTH_M / NEAREST);
   }
 
-  // m a pixel, in round steps so that it rests while the ellipse varies.
-  _scaleOf(fix) {
+  // m a pixel at which the ellipse is on the map, or another place; in round steps so that it rests while they vary.
+  _scaleOf(fix, other) {
+    if (other === null) return 0;
     const axis = fix.covariance ? axes(fix.covariance).major : 100;
-    const exact = (RING_95 * axis) / (FILL * (Math.min(this.width, this.height) / 2));
-    return 2 ** (Math.ceil(Math.log2(exact) * 2) / 2);
+    const reach = other ? EARTH_M * geoDistance(point(fix), point(other)) : RING_95 * axis;
+    return 2 ** (Math.ceil(Math.log2(reach / (FILL * (Math.min(this.width, this.height) / 2))) * 2) / 2);
   }
 
-  // m a pixel at which GNSS's place is on the map too, in the same steps; 0 without one.
-  _scaleWithGnss(fix) {
-    const { gnss } = this.data;
-    if (!gnss) return 0;
-    const apart = EARTH_M * geoDistance([fix.longitude, fix.latitude], [gnss.longitude, gnss.latitude]);
-    return apart ? 2 ** (Math.ceil(Math.log2(apart / (FILL * (Math.min(this.width, this.height) / 2))) * 2) / 2) : 0;
-  }
-
-  _project([lon, lat]) {
-    return this.projection([lon, lat]);
+  // Where a place is in the view, px; null if it is not near it, or there is none.
+  _at(place) {
+    return place && this._isHere(point(place)) ? this.projection(point(place)) : null;
   }
 
   // A line through points [lon, lat]. Near, d3 would drop points that are metres apart.
   _line(points) {
     if (this.wide) return this.path({ type: "LineString", coordinates: points }) ?? "";
-    const seen = points.filter((p) => this._isHere(p)).map((p) => this._project(p).map((v) => v.toFixed(2)).join(" "));
+    const seen = points.filter((p) => this._isHere(p)).map((p) => this.projection(p).map((v) => v.toFixed(2)).join(" "));
     return seen.length > 1 ? `M${seen.join("L")}` : "";
   }
 
@@ -158,7 +152,7 @@ export class EarthMap {
     const { lon, lat } = this.view;
     const put = (point, at, said, top) => {
       if (!this._isHere(point)) return;
-      const [x, y] = this._project(point);
+      const [x, y] = this.projection(point);
       const place = at(x, y);
       if (place[0] > this.width - 270 && place[1] < 48) return; // the buttons
       if (place[0] < 0 || place[0] > this.width - 80 || place[1] < top || place[1] > this.height - 44) return;
@@ -181,18 +175,17 @@ export class EarthMap {
     this.track.setAttribute("d", points.length > 1 ? this._line(points) : "");
     this.svg.classList.toggle("old", Boolean(this.data.old));
     const dot = ([x, y]) => `M${x.toFixed(1)} ${y.toFixed(1)}h0`;
-    const here = points.slice(0, -1).filter((p) => this._isHere(p)).map((p) => this._project(p));
+    const here = points.slice(0, -1).filter((p) => this._isHere(p)).map((p) => this.projection(p));
     const seen = here.filter(([x, y]) => x > -5 && y > -5 && x < this.width + 5 && y < this.height + 5);
     this.dots.setAttribute("d", seen.map(dot).join(""));
   }
 
   _drawEllipse(which, fix) {
     const { group, inner, outer, mark } = this.ellipses[which];
-    const shown = fix && this._isHere([fix.longitude, fix.latitude]);
-    group.classList.toggle("hidden", !shown);
-    if (!shown) return;
-    const [x, y] = this._project([fix.longitude, fix.latitude]);
-    const move = `translate(${x.toFixed(2)} ${y.toFixed(2)})`;
+    const at = this._at(fix);
+    group.classList.toggle("hidden", !at);
+    if (!at) return;
+    const move = translate(at);
     mark.setAttribute("transform", move);
     if (which === "newest") {
       this.ray.setAttribute("transform", `${move} rotate(${this.data.azimuth ?? 0})`);
@@ -205,13 +198,12 @@ export class EarthMap {
 
   _drawGnss() {
     const { gnss } = this.data;
-    const shown = gnss && this._isHere([gnss.longitude, gnss.latitude]);
-    this.gnss.classList.toggle("hidden", !shown);
+    const at = this._at(gnss);
+    this.gnss.classList.toggle("hidden", !at);
     element("legend-gnss").classList.toggle("hidden", !gnss);
     element("legend-gnss").dataset.status = gnss?.status ?? "";
-    if (!shown) return;
-    const [x, y] = this._project([gnss.longitude, gnss.latitude]);
-    this.gnss.setAttribute("transform", `translate(${x.toFixed(2)} ${y.toFixed(2)})`);
+    if (!at) return;
+    this.gnss.setAttribute("transform", translate(at));
     this.gnss.dataset.status = gnss.status;
   }
 
@@ -228,8 +220,7 @@ export class EarthMap {
   }
 
   _inView(fix) {
-    if (!this._isHere([fix.longitude, fix.latitude])) return false;
-    const [x, y] = this._project([fix.longitude, fix.latitude]);
+    const [x, y] = this._at(fix) ?? [-1, -1];
     return x >= 0 && y >= 0 && x <= this.width && y <= this.height;
   }
 
@@ -307,6 +298,9 @@ export class EarthMap {
   }
 }
 
+const point = ({ longitude, latitude }) => [longitude, latitude];
+const translate = ([x, y]) => `translate(${x.toFixed(2)} ${y.toFixed(2)})`;
+
 // Semi-axes of one sigma [m] and the direction of the longer one, clockwise from north [rad].
 export function axes([ee, en, nn]) {
   const mean = (ee + nn) / 2;
@@ -321,23 +315,14 @@ export function axes([ee, en, nn]) {
 // [lon, lat] around the ellipse of so many sigmas, on the sphere.
 function ellipse(fix, sigmas) {
   const { major, minor, turn } = axes(fix.covariance);
+  const here = geoRotation(point(fix).map((degrees) => -degrees));
   return Array.from({ length: CORNERS + 1 }, (_, i) => {
     const t = (2 * Math.PI * i) / CORNERS;
     const [along, across] = [sigmas * major * Math.cos(t), sigmas * minor * Math.sin(t)];
     const north = along * Math.cos(turn) - across * Math.sin(turn);
     const east = along * Math.sin(turn) + across * Math.cos(turn);
-    return travelled(fix, east, north);
+    const [arc, bearing] = [Math.hypot(east, north) / EARTH_M, Math.atan2(east, north)];
+    const [right, up] = [Math.sin(arc) * Math.sin(bearing), Math.sin(arc) * Math.cos(bearing)];
+    return here.invert([Math.atan2(right, Math.cos(arc)) / RAD, Math.asin(up) / RAD]);
   });
-}
-
-function travelled({ latitude, longitude }, east, north) {
-  const arc = Math.hypot(east, north) / EARTH_M;
-  const bearing = Math.atan2(east, north);
-  const phi = latitude * RAD;
-  const there = Math.asin(Math.sin(phi) * Math.cos(arc) + Math.cos(phi) * Math.sin(arc) * Math.cos(bearing));
-  const turn = Math.atan2(
-    Math.sin(bearing) * Math.sin(arc) * Math.cos(phi),
-    Math.cos(arc) - Math.sin(phi) * Math.sin(there),
-  );
-  return [longitude + turn / RAD, there / RAD];
 }

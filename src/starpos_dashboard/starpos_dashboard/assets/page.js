@@ -25,9 +25,8 @@ export function rows(parent, list, make, fill) {
   list.forEach((row, i) => fill(parent.children[i], row));
 }
 
-// A card whose data is old, or missing, looks so; the badge says how old.
-export function dress(card, badge, state, text) {
-  element(card).classList.toggle("old", state === "old");
-  element(card).classList.toggle("missing", state === "missing");
-  say(badge, text);
+// A card whose data is old, or missing, looks so; its badge says how old.
+export function dress(name, state, badge) {
+  for (const kind of ["old", "missing"]) element(`${name}-card`).classList.toggle(kind, state === kind);
+  say(`${name}-age`, badge);
 }

@@ -8,22 +8,24 @@ const known = (value) => typeof value === "number" && Number.isFinite(value);
 const decimals = (sigma, unknown, most = 6) =>
   known(sigma) && sigma > 0 ? Math.min(most, Math.max(0, Math.ceil(-Math.log10(sigma / 2)))) : unknown;
 
-// An angle as degrees, minutes and seconds; sigma in degrees says how far down.
+// The size of an angle as degrees, minutes and seconds, rounded to `finest` arcseconds, 3600, 60 or 1, or to decimals of one.
+export function parts(degrees, finest, places) {
+  const units = 10 ** places;
+  const exact = Math.round((Math.abs(degrees) * 3600 * units) / finest) * finest;
+  const pad = (n, width = 2) => String(n).padStart(width, "0");
+  const seconds = ((exact % (60 * units)) / units).toFixed(places);
+  let said = `${Math.floor(exact / (3600 * units))}°`;
+  if (finest < 3600) said += `${pad(Math.floor(exact / (60 * units)) % 60)}′`;
+  if (finest < 60) said += `${pad(seconds, places ? 3 + places : 2)}″`;
+  return said;
+}
+
+// The same with the hemisphere; sigma in degrees says how far down.
 export function sexagesimal(degrees, signs, sigma) {
   if (!known(degrees)) return UNKNOWN;
-  const hemisphere = degrees < 0 ? signs[1] : signs[0];
+  const finest = known(sigma) && sigma > 1 ? 3600 : known(sigma) && sigma > 1 / 12 ? 60 : 1;
   const places = decimals(known(sigma) ? sigma * 3600 : null, 1, 3);
-  const coarse = known(sigma) && sigma > 1 ? 3600 : known(sigma) && sigma > 1 / 12 ? 60 : 1;
-  const units = 10 ** places;
-  const exact = Math.round((Math.abs(degrees) * 3600 * units) / coarse) * coarse;
-  const seconds = (exact % (60 * units)) / units;
-  const minutes = Math.floor(exact / (60 * units)) % 60;
-  const full = Math.floor(exact / (3600 * units));
-  const pad = (n, width = 2) => String(n).padStart(width, "0");
-  let said = `${full}°`;
-  if (coarse < 3600) said += `${pad(minutes)}′`;
-  if (coarse < 60) said += `${pad(seconds.toFixed(places), places ? 3 + places : 2)}″`;
-  return `${said} ${hemisphere}`;
+  return `${parts(degrees, finest, places)} ${degrees < 0 ? signs[1] : signs[0]}`;
 }
 
 // An angle with a sign, in degrees.
