@@ -180,7 +180,7 @@ def test_what_a_compiled_module_may_is_no_breach(walls):
     text = (
         '# Above, "as it stands.\n"""Text: from rclpy import Node."""\n'
         "from libc.math cimport sqrt\nfrom starpos._numeric.algebra cimport Point\ncimport starpos._numeric.wide\n"
-        "from starpos.earth._air cimport Air\n"
+        "from starpos.earth._air cimport Refraction\n"
         'cdef extern from *:\n    """\n    By C.\n    """\n    void f()\n'
         'def f():\n    """As many as `many`."""\n    return "# no comment"\n'
     )

@@ -53,7 +53,6 @@ class AfterSolution:
         # Subscribe once now, so that a wrong qos_override is refused at the start.
         node.destroy_subscription(self._subscribe_solutions())
         self._waiting: Subject | None = None
-        self._busy = False
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._patience = node.create_timer(PATIENCE_S, self._give_up, clock=steady, autostart=False)
         self._worker = Worker(self.work, node.create_guard_condition(self._on_wake).trigger, name)
@@ -61,7 +60,6 @@ class AfterSolution:
 
     @property
     def wanted(self) -> bool:
-        """Whether the result has subscribers."""
         return self.publisher.get_subscription_count() > 0
 
     def work(self, job: Any) -> Any:
@@ -82,7 +80,7 @@ class AfterSolution:
             return
         if self._solutions is None:
             self._solutions = self._subscribe_solutions()
-        if self._waiting or self._busy:
+        if self._waiting or not self._worker.idle:
             return
         self._waiting = Subject(frame, stars, header)
         if self._solutions.get_publisher_count():
@@ -110,16 +108,13 @@ class AfterSolution:
             self._begin(None, f"no solution within {PATIENCE_S:g} s")
 
     def _begin(self, solution: Solution | None, without: str = "") -> None:
-        """Work on the frame that waits."""
         self._patience.cancel()
         subject, self._waiting = self._waiting, None
         if subject is not None and self.wanted and (job := self.job(subject, solution, without)) is not None:
-            self._busy = True
             self._worker.offer(job)
 
     def _on_wake(self) -> None:
         for result in self._worker.fetch():
-            self._busy = False
             if isinstance(result, self._kind):
                 self.publisher.publish(result)
                 self._troubles.right(self._name)

@@ -13,7 +13,6 @@ import rclpy.parameter
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from rclpy.timer import Timer
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
@@ -62,8 +61,11 @@ class PreparedFrame:
 class CameraNode(Node):
     """Publishes sensor_msgs/Image, CameraInfo and starpos_interfaces/Capture; see README.md."""
 
-    def __init__(self, **options: Any) -> None:
-        """Make the node; options: as for rclpy's Node (context, namespace, parameter_overrides ...)."""
+    def __init__(self, detector: "DetectorNode | None" = None, **options: Any) -> None:
+        """Make the node; options: as for rclpy's Node.
+
+        detector: gets each frame in this process too, without a copy, in the executor's thread.
+        """
         super().__init__("camera", **options)
         self._values = declare(
             self, parameters_of("camera"), apply=self._apply, check=lambda values, _: _complaint(values)
@@ -94,7 +96,7 @@ class CameraNode(Node):
         self._last_took_s = 0.0
         # Columns and rows of the frames.
         self._size: tuple[int, int] | None = None
-        self._detectors: list[DetectorNode] = []
+        self._detector = detector
         self._ended = False
         self._state = (Level.WARN, "no frame has been taken yet.")
         self._said_s = -math.inf
@@ -109,8 +111,9 @@ class CameraNode(Node):
         self._clock_report = ClockReport(self, self._stamped_by_system)
         tasks: dict[str, Callable[[], Diagnosis]] = {"Capture": self._report, "Clock": self._clock_report}
         self._diagnostics = Diagnostics(self, tasks, self._source.hardware_id)
-        self._timer: Timer | None = None
-        self._start_timer()
+        # Simulated time sets the pace of a replay. The system's clock may be stepped, and a timer on it would wait.
+        clock = self.get_clock() if time_is_simulated(self) else Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self.create_timer(self._values["cadence"], self._tick, clock=clock)
         self._worker.start()
         if lack := self._source.lacking():
             self._say(Level.WARN, lack)
@@ -121,28 +124,16 @@ class CameraNode(Node):
         self._source.close()
         self._worker.stop()
 
-    def hand_to(self, detector: "DetectorNode") -> None:
-        """Give each frame to a detector in this process too, without a copy, in the executor's thread."""
-        self._detectors.append(detector)
-
     def _now_s(self) -> float:
         return self.get_clock().now().nanoseconds * 1e-9
 
     def _stamped_by_system(self) -> bool:
         return self._last is None or self._last.stamp_source in OF_SYSTEM_CLOCK
 
-    def _start_timer(self) -> None:
-        if self._timer is not None:
-            self.destroy_timer(self._timer)
-        # Simulated time sets the pace of a replay. The system's clock may be stepped, and a timer on it would wait.
-        simulated = time_is_simulated(self)
-        clock = self.get_clock() if simulated else Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(self._values["cadence"], self._tick, clock=clock)
-
     def _apply(self, names: frozenset[str]) -> None:
         if "cadence" in names:
-            self._start_timer()
-        self._source.update(self._values)
+            self._timer.timer_period_ns = round(1e9 * self._values["cadence"])
+            self._timer.reset()
 
     def _tick(self) -> None:
         if self._ended:
@@ -152,14 +143,15 @@ class CameraNode(Node):
         elif self._source.waits_for_listener and not self._frames and not self._heard():
             # Missing parts are reported first, because a subscriber would not help.
             lack = self._source.lacking()
-            stars = " or of the stars" if self._detectors else ""
+            stars = " or of the stars" if self._detector else ""
             waiting = f"waiting for a subscriber of {self._images.topic_name}{stars}."
             self._say(Level.WARN if lack else Level.OK, lack or waiting)
         else:
             self._worker.offer(_settings(self._values))
 
     def _heard(self) -> bool:
-        return self._images.get_subscription_count() > 0 or any(d.wanted for d in self._detectors)
+        wanted = self._detector is not None and self._detector.wanted
+        return wanted or self._images.get_subscription_count() > 0
 
     def _prepare(self, settings: CaptureSettings) -> PreparedFrame:
         """Take a frame and make it ready to be published, in the worker's thread."""
@@ -190,11 +182,9 @@ class CameraNode(Node):
         return PreparedFrame(exposure, capture, image, time.monotonic() - begin)
 
     def _capture(self, settings: CaptureSettings) -> CapturedFrame:
-        if self._shutter is None:
-            return in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
         since_s = self._now_s()
         exposure = in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
-        return self._shutter.date_frame(exposure, since_s, self._now_s())
+        return self._shutter.date_frame(exposure, since_s, self._now_s()) if self._shutter else exposure
 
     def _on_wake(self) -> None:
         for result in self._worker.fetch():
@@ -225,8 +215,8 @@ class CameraNode(Node):
         self._infos.publish(info)
         if prepared.image is not None:
             self._images.publish(prepared.image)
-        for detector in self._detectors:
-            detector.submit(frame, capture.header)
+        if self._detector is not None:
+            self._detector.submit(frame, capture.header)
         self._frames += 1
         self._last, self._last_took_s = capture, prepared.seconds
         self._size = frame.width, frame.height

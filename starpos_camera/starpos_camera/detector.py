@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
@@ -47,46 +46,32 @@ RAW, COMPRESSED = "camera/image_raw", "camera/image_raw/compressed"
 IMAGE_DEPTH = 1
 # how often publishers are compared with the subscriptions
 PUBLISHERS_LOOK_S = 0.5
-# A driver that sends MJPEG may offer the raw topic, too, and never send on it.
-RAW_PATIENCE_S = 5.0
 
 
 class FrameTopics:
-    """Subscribes to the raw topic, and to the compressed one where no raw frame comes; each frame is taken once.
+    """Subscribes to the raw topic, and to the compressed one until a raw frame comes; each frame is taken once.
 
+    A driver that sends MJPEG may offer the raw topic, too, and never send on it.
     take: takes an Image or a CompressedImage.
+    both: hear both topics all the time, as in a replay, where which of them sends shows only message by message.
     """
 
-    def __init__(self, node: Node, take: Take) -> None:
-        self._node, self._take = node, take
+    def __init__(self, node: Node, take: Take, both: bool) -> None:
+        self._node, self._take, self._both = node, take, both
         # with the raw topic the compressed one moves, unless it is remapped itself
         self.compressed_topic = node.resolve_topic_name(COMPRESSED)
         if self.compressed_topic == node.resolve_topic_name(COMPRESSED, only_expand=True):
             self.compressed_topic = f"{node.resolve_topic_name(RAW)}/compressed"
-        self._raw: MatchedSubscription | None = None
-        self._compressed: MatchedSubscription | None = None
-        self._both = self._raw_sends = False
-        # since when a raw publisher is there, monotonic
-        self._offered_s: float | None = None
         # stamp of the last frame of each topic
         self._stamps: dict[type, tuple[int, int]] = {}
-
-    def listen(self, both: bool) -> None:
-        """Subscribe.
-
-        both: hear both topics from the start, as in a replay, where which of them sends shows only message by message.
-        """
-        self._both = both
-        self._raw = MatchedSubscription(self._node, Image, RAW, self._pass_raw, IMAGE_DEPTH)
+        self._raw_sends = False
+        self._compressed: MatchedSubscription | None = None
+        self._raw = MatchedSubscription(node, Image, RAW, self._pass_raw, IMAGE_DEPTH)
+        # Where frames are expected, for sentences.
+        self.where = f" on {self._raw.topic}"
         self._look()
-        self._timer = self._node.create_timer(
-            PUBLISHERS_LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
-
-    @property
-    def where(self) -> str:
-        """Where frames are expected, for sentences; '' where nothing is subscribed."""
-        return f" on {self._raw.topic}" if self._raw else ""
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(PUBLISHERS_LOOK_S, self._look, clock=steady)
 
     def unheard(self) -> str:
         """Sentence on publishers that cannot be heard, and why; '' without any."""
@@ -95,7 +80,7 @@ class FrameTopics:
 
     def missing(self) -> str:
         """The rest of a sentence on why no frame comes; '' where a publisher is heard."""
-        if self._raw is None or self._raw.publishers or self._compressed is not None:
+        if self._raw.publishers or self._compressed is not None:
             return ""
         elsewhere = self._raw.elsewhere()
         hint = (
@@ -107,16 +92,10 @@ class FrameTopics:
 
     def _look(self) -> None:
         """Adapt the subscriptions to what is published."""
-        assert self._raw is not None
         self._raw.look()
-        now_s = time.monotonic()
-        if not self._raw.publishers:
-            self._raw_sends, self._offered_s = False, None
-        elif self._offered_s is None:
-            self._offered_s = now_s
-        silent_s = None if self._offered_s is None else now_s - self._offered_s
+        self._raw_sends &= bool(self._raw.publishers)
         offered = self._node.count_publishers(self.compressed_topic) > 0
-        wanted = self._both or (offered and not self._raw_sends and wants_compressed(silent_s))
+        wanted = self._both or (offered and not self._raw_sends)
         if wanted and self._compressed is None:
             topic = self.compressed_topic
             self._compressed = MatchedSubscription(
@@ -141,11 +120,6 @@ class FrameTopics:
         self._stamps[type(message)] = key_of(message.header)
         if self._stamps.get(other) != key_of(message.header):
             self._take(message, info)
-
-
-def wants_compressed(silent_s: float | None) -> bool:
-    """Whether compressed frames are wanted, by the time for which raw ones are offered and none has come, None: not."""
-    return silent_s is None or silent_s > RAW_PATIENCE_S
 
 
 # Time that an image waits for its Capture, which comes on another topic: if a busy machine lost it, the middleware
@@ -213,8 +187,11 @@ class DayExposure:
 class DetectorNode(Node):
     """Publishes starpos_interfaces/StarArray on `stars`, and frames with marks on `~/image_annotated`; see README.md."""
 
-    def __init__(self, **options: Any) -> None:
-        """Make the node; options: as for rclpy's Node (context, namespace, parameter_overrides ...)."""
+    def __init__(self, listens: bool = True, **options: Any) -> None:
+        """Make the node; options: as for rclpy's Node.
+
+        listens: take the frames of `camera/image_raw`; otherwise a camera in the same process calls `submit`.
+        """
         super().__init__("detector", **options)
         self._values = declare(self, parameters_of("detector"), apply=self._apply)
         self._settings = DetectionSettings.by_parameters(self._values)
@@ -234,7 +211,8 @@ class DetectorNode(Node):
         self._last_frame_s: float | None = None
         self._interval_s: float | None = None
         self._publisher = publisher(self, StarArray, "stars", 10)
-        self._topics = FrameTopics(self, self._on_image)
+        # None: a camera in this process hands over its frames.
+        self._topics: FrameTopics | None = None
         self._captures_come: Callable[[], int] = lambda: 0
         self._annotator = Annotator(self)
         self._day = DayExposure(self) if self._values["day_exposure"] else None
@@ -242,16 +220,16 @@ class DetectorNode(Node):
         self._wake = self.create_guard_condition(self._on_wake)
         self._worker = Worker(self._detect, self._wake.trigger, "detection")
         self._diagnostics = Diagnostics(self, {"Stars": self._report})
-        _warm_up()
         self._worker.start()
+        if listens:
+            self._listen()
 
-    def listen(self) -> None:
-        """Take the frames of `camera/image_raw`. A camera in the same process calls `submit` instead."""
+    def _listen(self) -> None:
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._look = self.create_timer(LOOK_S, self._go_on, clock=steady, autostart=False)
         captures = subscription(self, Capture, "camera/capture", self._on_capture, CAPTURES_KEPT)
         self._captures_come = captures.get_publisher_count
-        self._topics.listen(both=time_is_simulated(self))
+        self._topics = FrameTopics(self, self._on_image, both=time_is_simulated(self))
 
     def close(self) -> None:
         self._worker.stop()
@@ -406,7 +384,7 @@ class DetectorNode(Node):
 
     def _unsaid(self) -> str:
         """Sentence on the parameters to state of the camera; '' if there is nothing."""
-        unsaid = self._exposures.missing_statement if self._topics.where and not self._captures_come() else ""
+        unsaid = self._exposures.missing_statement if self._topics and not self._captures_come() else ""
         if unsaid:
             self._troubles.wrong("stamps", unsaid)
         return unsaid
@@ -422,22 +400,23 @@ class DetectorNode(Node):
         if last and last.detection.left_out:
             level = Level.WARN
             sentence += f" {last.detection.left_out} fainter peaks are left out: too many for stars, check the exposure."
+        topics, where = self._topics, self._topics.where if self._topics else ""
         silence_s = time.monotonic() - self._last_frame_s if self._last_frame_s is not None else math.inf
         if self._last_frame_s is None:
             level, sentence = (
                 Level.WARN,
-                f"no frame has come yet{self._topics.where}{self._topics.missing()}.",
+                f"no frame has come yet{where}{topics.missing() if topics else ''}.",
             )
         elif complaint:
             level, sentence = Level.WARN, complaint
         elif silence_s > max(MIN_SILENCE_S, 3 * (self._interval_s or 0.0)):
             level = Level.WARN
-            sentence = f"no frame for {silence_s:.0f} s{self._topics.where}: is the camera running?"
+            sentence = f"no frame for {silence_s:.0f} s{where}: is the camera running?"
         elif dropped := self._pace.complaint:
             level, sentence = Level.WARN, f"{sentence} {dropped}."
         elif unsaid := self._unsaid():
             level, sentence = Level.WARN, f"{sentence} {unsaid}"
-        if unheard := self._topics.unheard():
+        if topics and (unheard := topics.unheard()):
             self._troubles.wrong("unheard", unheard)
             level, sentence = Level.WARN, f"{unheard} {sentence}"
         values: dict[str, object] = {
@@ -459,15 +438,3 @@ class DetectorNode(Node):
                 "seconds": last.seconds,
             }
         return Diagnosis(level, sentence, values)
-
-
-def _warm_up() -> None:
-    """Run everything once on a small frame with a few stars, so that the first real frame is not slow."""
-    y, x = np.mgrid[:128, :128]
-    light = np.random.default_rng(0).normal(500.0, 10.0, x.shape)
-    for cx, cy in ((30.2, 40.7), (80.5, 30.1), (60.9, 95.4), (100.3, 101.8)):
-        light += 3000.0 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 2.0)
-    detection = detect(
-        Frame(light.astype(np.uint16), pattern="", mid_unix_s=0.0, exposure_s=1.0, source="warm-up")
-    )
-    stars_to_message(detection.stars, "")

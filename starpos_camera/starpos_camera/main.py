@@ -11,23 +11,13 @@ if TYPE_CHECKING:
 
 
 def camera() -> int:
-    """Run the node `camera`."""
     about = "The frames of a camera, until Ctrl-C."
     return run_executable("starpos_camera", "camera", about, "camera:CameraNode")
 
 
 def detector() -> int:
-    """Run the node `detector`."""
-
-    def make_nodes() -> "Iterator[Node]":
-        from starpos_camera.detector import DetectorNode
-
-        node = DetectorNode()
-        node.listen()
-        yield node
-
     about = "The stars of the frames on camera/image_raw, until Ctrl-C."
-    return run_executable("starpos_camera", "detector", about, make_nodes)
+    return run_executable("starpos_camera", "detector", about, "detector:DetectorNode")
 
 
 def camera_detector() -> int:
@@ -37,11 +27,9 @@ def camera_detector() -> int:
         from starpos_camera.camera import CameraNode
         from starpos_camera.detector import DetectorNode
 
-        detector = DetectorNode()
+        detector = DetectorNode(listens=False)
         yield detector
-        camera = CameraNode()
-        camera.hand_to(detector)
-        yield camera
+        yield CameraNode(detector)
 
     about = "The frames of a camera and their stars, two nodes in one process, until Ctrl-C."
     return run_executable("starpos_camera", "camera_detector", about, make_nodes, ("camera", "detector"))

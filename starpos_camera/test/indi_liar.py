@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """An INDI driver (standard input and output) whose camera answers each exposure as STARPOS_LIES has it (JSON).
 
-cut: bytes that the BLOB lacks; format; size: what it claims; packed: with zlib; header: cards of the FITS; exposure: a
+cut: bytes that the BLOB lacks; format; size: what it claims; header: cards of the FITS; exposure: a
 state instead of a frame; connect: the state that connecting ends in.
 """
 
@@ -11,7 +11,6 @@ import json
 import os
 import sys
 import xml.etree.ElementTree as ET
-import zlib
 from datetime import datetime, timezone
 
 import numpy as np
@@ -72,8 +71,6 @@ def expose(seconds):
     fits.PrimaryHDU(PIXELS, header).writeto(file)
     data = file.getvalue()
     size = LIES.get("size", len(data))
-    if LIES.get("packed"):
-        data = zlib.compress(data)
     data = base64.encodebytes(data[: len(data) - LIES.get("cut", 0)]).decode()
     blob = f'<oneBLOB name="CCD1" size="{size}" format="{LIES.get("format", ".fits")}">\n{data}</oneBLOB>'
     say(f'<setBLOBVector device="{DEVICE}" name="CCD1" state="Ok">{blob}</setBLOBVector>')

@@ -37,7 +37,7 @@ class Inside:
     def __init__(self, frame):
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
-        self.detector = DetectorNode(context=self.context)
+        self.detector = DetectorNode(listens=False, context=self.context)
         self.viewer = rclpy.create_node("viewer", context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.detector)

@@ -25,7 +25,6 @@ from starpos_camera.sources.aravis import (
     best_format,
     clock_relation,
     library,
-    on_host_clock,
     stamp_of_camera,
 )
 from starpos_camera.sources.source import CaptureError, CaptureSettings, decoded
@@ -183,13 +182,9 @@ def test_the_deepest_format_is_taken_and_of_a_colour_sensor_its_mosaic():
         best_format(["Mono12p", "RGB8"], "RGB8")
 
 
-# The camera's time of a frame by the node's clock, and its error.
-AT = (1000.01, 1e-4)
-
-
-def dated(at=AT, commanded_s=1000.0, received_s=1000.6, moment="unknown"):
+def dated(at_s=20.01, relation=(980.0, 1e-4), commanded_s=1000.0, received_s=1000.6, moment="unknown"):
     frame = Frame(np.zeros((8, 8), np.uint8))
-    return stamp_of_camera(frame, at, 0.5, commanded_s, received_s, values(timestamp=moment))
+    return stamp_of_camera(frame, at_s, relation, 0.5, commanded_s, received_s, values(timestamp=moment))
 
 
 @pytest.mark.parametrize(
@@ -197,19 +192,23 @@ def dated(at=AT, commanded_s=1000.0, received_s=1000.6, moment="unknown"):
     [
         # Start or end of the exposure: only one fits between trigger and arrival.
         ({}, 1000.26, Capture.HARDWARE),
-        ({"at": (1000.55, 1e-4)}, 1000.30, Capture.HARDWARE),
+        ({"at_s": 20.55}, 1000.30, Capture.HARDWARE),
         ({"moment": "start"}, 1000.26, Capture.HARDWARE),
         # Both fit, if a frame comes late.
-        ({"at": (1000.55, 1e-4), "received_s": 1001.1}, 1000.55, Capture.HARDWARE),
-        ({"at": (1000.55, 1e-4), "received_s": 1001.1, "moment": "start"}, 1000.80, Capture.HARDWARE),
+        ({"at_s": 20.55, "received_s": 1001.1}, 1000.55, Capture.HARDWARE),
+        ({"at_s": 20.55, "received_s": 1001.1, "moment": "start"}, 1000.80, Capture.HARDWARE),
         # Impossible stated values, and impossible exposures.
         ({"moment": "end"}, 1000.25, Capture.COMMAND),
-        ({"at": (999.0, 1e-4)}, 1000.25, Capture.COMMAND),
-        ({"at": (1001.0, 1e-4)}, 1000.25, Capture.COMMAND),
-        ({"at": None}, 1000.25, Capture.COMMAND),
+        ({"at_s": 19.0}, 1000.25, Capture.COMMAND),
+        ({"at_s": 21.0}, 1000.25, Capture.COMMAND),
+        # A clock that cannot be read may keep UTC.
+        ({"relation": None, "at_s": 1000.01}, 1000.26, Capture.HARDWARE),
+        ({"relation": None}, 1000.25, Capture.COMMAND),
+        ({"at_s": None}, 1000.25, Capture.COMMAND),
         # A line has triggered.
-        ({"commanded_s": None, "at": (1000.55, 1e-4)}, 1000.30, Capture.HARDWARE),
-        ({"commanded_s": None, "at": None}, 1000.35, Capture.DRIVER),
+        ({"commanded_s": None, "at_s": 20.55}, 1000.30, Capture.HARDWARE),
+        ({"commanded_s": None, "at_s": None}, 1000.35, Capture.DRIVER),
+        ({"commanded_s": None, "relation": None, "at_s": 1000.55, "moment": "end"}, 1000.35, Capture.DRIVER),
     ],
 )
 def test_the_stamp_is_the_middle_wherever_the_cameras_time_is_of(given, middle_s, source):
@@ -220,17 +219,12 @@ def test_the_stamp_is_the_middle_wherever_the_cameras_time_is_of(given, middle_s
 
 def test_the_stamps_error_holds_what_is_not_known():
     assert dated().frame.stamp_stddev_s == pytest.approx(np.hypot(1e-3, 1e-4))
-    either = dated(at=(1000.55, 1e-4), received_s=1001.1)
+    either = dated(at_s=20.55, received_s=1001.1)
     # At 0.25 s from one or the other.
     assert either.frame.stamp_stddev_s == pytest.approx(0.25, rel=1e-3)
+    utc = dated(relation=None, at_s=1000.01)
+    assert utc.frame.stamp_stddev_s == pytest.approx(np.hypot(0.1 / np.sqrt(3), 1e-3))
     assert "contradict" in dated(moment="end").remark
-
-
-def test_a_clock_that_cannot_be_read_may_keep_utc():
-    assert on_host_clock(20.01, (980.0, 1e-4), 0.5, 1000.0, 1000.6) == AT
-    assert on_host_clock(1000.01, None, 0.5, 1000.0, 1000.6) == pytest.approx((1000.01, 0.1 / np.sqrt(3)))
-    assert on_host_clock(20.01, None, 0.5, 1000.0, 1000.6) is None
-    assert on_host_clock(1000.55, None, 0.5, None, 1000.6) is None
 
 
 class Clock:

@@ -9,7 +9,6 @@ import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 
-from starpos_camera.detector import wants_compressed
 from starpos_interfaces.msg import StarArray
 from starpos_testing.nodes import Listener, Process
 
@@ -164,8 +163,3 @@ def test_a_reliable_publisher_is_heard_reliably_and_the_other_is_named(best_effo
     assert graph.shown(best_effort, raw(pixels)).stars
     status, out = graph.process.end(signal.SIGINT)
     assert status == 0 and why in out and "nothing says which moment" in out
-
-
-def test_compressed_frames_are_wanted_where_the_raw_topic_is_silent():
-    """usb_cam offers both with MJPEG, and sends compressed ones only."""
-    assert wants_compressed(None) and wants_compressed(6.0) and not wants_compressed(4.0)

@@ -73,7 +73,7 @@ def test_a_folder_may_come_later_and_one_without_frames_is_said(tmp_path, folder
     source = make(files__path=str(tmp_path / "later"))
     (error,) = play(source, 1)
     assert "no frames here" in str(error) and str(error) == source.lacking()
-    assert "cannot be listed" in make(files__path="~no_such_user/x").lacking()
+    assert "no frames here" in make(files__path="~no_such_user/x").lacking()
     (tmp_path / "later").mkdir()
     (tmp_path / "later" / "a.fits").write_bytes((folder / "0.fits").read_bytes())
     (exposure,) = play(source, 1)
@@ -111,9 +111,10 @@ def test_simulated_stars_are_where_starpos_says(scene):
 
 
 def test_simulated_sky_follows_its_parameters(scene):
-    source = make(**SMALL)
+    given = values(**SMALL)
+    source = made(given, SETTINGS, lambda: NOW_S)
     before = source.capture(SETTINGS).frame
-    source.update(values(**SMALL, simulated__azimuth=130.0))
+    given["simulated.azimuth"] = 130.0
     after = source.capture(CaptureSettings(1.0, None, 5.0)).frame
     assert after.exposure_s == 1.0
     assert abs(before.pixels.astype(int) - after.pixels).max() > 1000

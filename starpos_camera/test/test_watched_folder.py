@@ -361,7 +361,6 @@ def test_the_node_waits_for_frames_and_takes_them(folder, start, listener):
     [
         ("/x", {"files__loop": True}, "files.loop"),
         ("/x*/y*.fits", {}, "last part"),
-        ("~no_such_user/x", {}, "check it"),
     ],
 )
 def test_what_cannot_be_watched_is_refused(path, changes, words):

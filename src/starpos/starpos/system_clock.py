@@ -7,6 +7,7 @@ grows by 500 ppm while nothing corrects the clock. chrony, systemd-timesyncd, nt
 
 import ctypes
 import math
+import struct
 import threading
 import time
 from collections.abc import Callable
@@ -27,23 +28,8 @@ UNKNOWN_S = DAY_S / math.sqrt(12)
 SLEW = 0.1
 
 
-class _Timex(ctypes.Structure):
-    """struct timex of <sys/timex.h>."""
-
-    _fields_ = (
-        ("modes", ctypes.c_uint),
-        *((name, ctypes.c_long) for name in ("offset", "freq", "maxerror", "esterror")),
-        ("status", ctypes.c_int),
-        *(
-            (name, ctypes.c_long)
-            for name in ("constant", "precision", "tolerance", "seconds", "microseconds", "tick")
-        ),
-        *((name, ctypes.c_long) for name in ("ppsfreq", "jitter")),
-        ("shift", ctypes.c_int),
-        *((name, ctypes.c_long) for name in ("stabil", "jitcnt", "calcnt", "errcnt", "stbcnt")),
-        ("tai", ctypes.c_int),
-        ("reserved", ctypes.c_int * 11),
-    )
+# struct timex of <sys/timex.h> begins with modes, offset, freq, maxerror, esterror, status; room for all of it, and more
+TIMEX, TIMEX_BYTES = struct.Struct("@Illlli"), 512
 
 
 @dataclass(frozen=True)
@@ -77,15 +63,16 @@ class SystemClock:
 
 def read() -> SystemClock | None:
     """Read the present state; None if the system does not report it (a container may forbid it)."""
-    state = _Timex()
+    state = ctypes.create_string_buffer(TIMEX_BYTES)
     try:
-        answer = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(state))
+        answer = ctypes.CDLL(None, use_errno=True).adjtimex(state)
     except (OSError, AttributeError):
         return None
     if answer < 0:
         return None
-    synchronised = answer != TIME_ERROR and not state.status & STA_UNSYNC
-    return SystemClock(synchronised, state.maxerror * 1e-6, state.esterror * 1e-6)
+    *_, max_error_us, est_error_us, status = TIMEX.unpack_from(state)
+    synchronised = answer != TIME_ERROR and not status & STA_UNSYNC
+    return SystemClock(synchronised, max_error_us * 1e-6, est_error_us * 1e-6)
 
 
 def both_clocks() -> tuple[float, float]:

@@ -6,14 +6,12 @@ import difflib
 import io
 import math
 import os
-import re
 import warnings
 from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,8 +26,6 @@ def packaged(package: str, name: str) -> list[dict[str, str]]:
     return list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
 
 
-# an empty cell, other than a line's first
-EMPTY = re.compile(r",[ \t]*(?=[,\r\n]|\Z)")
 # similarity from which an unknown column's name may be meant for a known one
 ALIKE_NAME = 0.7
 
@@ -99,25 +95,19 @@ class TableForm:
         used = {name: names.index(name) for name in (*self.needed, *self.optional) if name in names}
         start = text.tell()
         numbers = array("I")
-        # quickest first: numbers alone; with empty cells, comments or texts in other columns; anything
+        # quickest first: numbers alone; with empty cells, lines of comment or texts in other columns
         if (rows := _plain(text, len(names))) is not None:
             rows = rows[:, list(used.values())]
             numbers.extend(range(before + 2, before + 2 + len(rows)))
         else:
             text.seek(start)
+            cells = self._cells(_rows(text, numbers, before + 2), used, len(names))
             try:
-                lines = _filled(_rows(text, numbers, before + 2), len(names))
-                rows = _loaded(lines, usecols=list(used.values()))
+                rows = np.fromiter(cells, float)
             except UnicodeDecodeError:
                 raise
-            except ValueError:
-                text.seek(start)
-                del numbers[:]
-                cells = self._cells(_rows(text, numbers, before + 2), used, len(names))
-                try:
-                    rows = np.fromiter(cells, float)
-                except ValueError as e:
-                    raise self.error(f"{place}:{numbers[-1]}: {one_line(e)}: {self.cure}") from None
+            except ValueError as e:
+                raise self.error(f"{place}:{numbers[-1]}: {one_line(e)}: {self.cure}") from None
         rows = rows.reshape(-1, len(used))
         if len(rows) == 0 and not self.may_be_empty:
             raise self.error(f"{place}: the {self.what} has no rows: {self.cure}")
@@ -173,18 +163,14 @@ def _plain(text: io.TextIOBase, width: int) -> np.ndarray | None:
     """The cells (N, width) of the rest of a text, if each of its lines is a row of numbers; else None."""
     start = text.tell()
     try:
-        rows = _loaded(text, comments=None, ndmin=2)
+        with warnings.catch_warnings():
+            # our own error says that a table is empty
+            warnings.simplefilter("ignore")
+            rows = np.loadtxt(text, delimiter=",", comments=None, ndmin=2)
     except ValueError:
         return None
     text.seek(start)
     return rows if rows.shape == (sum(1 for _ in text), width) else None
-
-
-def _loaded(lines: Iterable[str], **how: Any) -> np.ndarray:
-    with warnings.catch_warnings():
-        # our own error says that a table is empty
-        warnings.simplefilter("ignore")
-        return np.loadtxt(lines, delimiter=",", **how)
 
 
 def _rows(text: Iterable[str], numbers: array, first: int) -> Iterator[str]:
@@ -193,14 +179,6 @@ def _rows(text: Iterable[str], numbers: array, first: int) -> Iterator[str]:
         if line.strip(", \t\r\n") and not line.startswith("#"):
             numbers.append(number)
             yield line
-
-
-def _filled(lines: Iterable[str], width: int) -> Iterator[str]:
-    """Lines with nan in their empty cells; ValueError at the first that is not `width` cells long."""
-    for line in lines:
-        if line.count(",") != width - 1:
-            raise ValueError
-        yield EMPTY.sub(",nan", line)
 
 
 def _number(cell: str, name: str) -> float:

@@ -9,7 +9,7 @@ import json
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -198,6 +198,8 @@ def sun_way(latitude_deg: float, longitude_deg: float, unix_s: float) -> list[li
 FAST_S = 5.0
 # Diagnostics kept.
 LIGHTS = 64
+# Fixes kept, the most that the parameter `track` can ask for.
+MAX_TRACK = 10_000
 # Looked at in one message.
 STATUSES = 256
 
@@ -205,36 +207,33 @@ STATUSES = 256
 class Board:
     """Takes messages and gives one JSON text, of bounded size. `changed`: a message came since the last `as_json`.
 
-    nodes: the nodes whose diagnostics are shown as lights, by their names in `namespace`, or whole ones; empty: all.
+    values: the node's parameters as they are at any time.
     """
 
     def __init__(
-        self,
-        track: int,
-        nodes: frozenset[str],
-        clock: Callable[[], float] = time.monotonic,
-        namespace: str = "/",
+        self, values: Mapping[str, Any], clock: Callable[[], float] = time.monotonic, namespace: str = "/"
     ) -> None:
         self.changed = False
-        self._namespace = namespace
-        self._nodes = self._seen(nodes)
+        self._values, self._namespace = values, namespace
         self._clock, self._since = clock, clock()
         # By topic: when it was heard, and what it said.
         self._heard: dict[str, tuple[float, dict[str, Any]]] = {}
         self._lights: dict[str, tuple[float, dict[str, Any]]] = {}
-        self._track: deque[tuple[int, float, float]] = deque(maxlen=track)
+        self._track: deque[tuple[int, float, float]] = deque(maxlen=MAX_TRACK)
         self._count = 0
         # a known place by the solver's diagnostics, deg
         self._site: tuple[float, float] | None = None
 
-    def keep_track_of(self, fixes: int) -> None:
-        """Keep this number of fixes from now on."""
-        self._track = deque(self._track, maxlen=fixes)
-
     @property
     def track(self) -> tuple[tuple[int, float, float], ...]:
         """(number, latitude, longitude) [deg] of the newest fixes, counted from 1."""
-        return tuple(self._track)
+        return tuple(self._track)[-self._values["track"] :]
+
+    @property
+    def _nodes(self) -> frozenset[str]:
+        """The nodes whose diagnostics are shown as lights, by their names in the namespace, or whole ones; empty: all."""
+        wanted = names(self._values["lights"])
+        return frozenset(seen_from(self._namespace, n) if n[0] == "/" else n for n in wanted)
 
     def hear_fix(self, message: NavSatFix) -> None:
         told = position(message)
@@ -254,10 +253,11 @@ class Board:
 
     def hear_diagnostics(self, message: DiagnosticArray) -> None:
         """Keep the diagnostics of the nodes that have lights."""
+        nodes = self._nodes
         for status in message.status[:STATUSES]:
             self._hear_site(status)
             name = seen_from(self._namespace, status.name)
-            if self._nodes and _node_of(name) not in self._nodes:
+            if nodes and _node_of(name) not in nodes:
                 continue
             told = light(status, name)
             # The newest has to be the last.
@@ -277,23 +277,6 @@ class Board:
         if abs(latitude) <= 90 and abs(longitude) <= 360:
             self._site = latitude, longitude
 
-    def show_frame(self, number: int, stamp_s: float | None, trouble: str = "") -> None:
-        """Note the number of a picture, or why it is missing."""
-        self.show("frame", {"number": number, "stamp": stamp_s, "trouble": text(trouble)})
-
-    def hide_frame(self) -> None:
-        """Forget the frame, because no page shows it and it would get old."""
-        self._heard.pop("frame", None)
-
-    def only_lights_of(self, nodes: frozenset[str]) -> None:
-        """Show the lights of these nodes from now on; empty: of all."""
-        self._nodes, self._since = self._seen(nodes), self._clock()
-        if nodes:
-            self._lights = {n: light for n, light in self._lights.items() if _node_of(n) in self._nodes}
-
-    def _seen(self, nodes: frozenset[str]) -> frozenset[str]:
-        return frozenset(seen_from(self._namespace, n) if n[0] == "/" else n for n in nodes)
-
     def _sun(self, now_s: float) -> list[list[float]] | None:
         """The Sun's way at the newest place, of the stars or of GNSS, or at a known one; None without any."""
         places = [self._heard.get(name, (0.0, {}))[1] for name in ("last_fix", "gnss")]
@@ -309,13 +292,14 @@ class Board:
         now_s: the node's time (Unix).  slow_s: age at which the values that come with each frame are old.
         """
         self.changed = False
-        now = self._clock()
+        now, nodes = self._clock(), self._nodes
         told: dict[str, Any] = {
             name: {**what, "age": now - since} for name, (since, what) in self._heard.items()
         }
-        lights = [{**light, "age": now - since} for since, light in self._lights.values()]
+        shown = {n: lit for n, lit in self._lights.items() if not nodes or _node_of(n) in nodes}
+        lights = [{**light, "age": now - since} for since, light in shown.values()]
         # A node that has said nothing yet has a light, too; otherwise an all-green page might lack the solver.
-        silent = self._nodes - {_node_of(name) for name in self._lights}
+        silent = nodes - {_node_of(name) for name in shown}
         unheard = {"level": STALE, "sentence": "nothing heard yet", "age": now - self._since}
         lights += [{"name": text(node, NAME_LETTERS), **unheard} for node in silent]
         told["sun"] = self._sun(now_s)
@@ -323,6 +307,11 @@ class Board:
         told["now"] = now_s
         told["old_after"] = {"slow": slow_s, "fast": min(FAST_S, slow_s)}
         return json.dumps(told, allow_nan=False, separators=(",", ":"))
+
+
+def names(text: str) -> frozenset[str]:
+    """Split a list separated by commas into its words."""
+    return frozenset(word.strip() for word in text.split(",") if word.strip())
 
 
 def _node_of(name: str) -> str:

@@ -67,13 +67,11 @@ class DashboardNode(Node):
     def __init__(self) -> None:
         super().__init__("dashboard")
         self._values = declare(self, parameters_of("dashboard"), apply=self._apply)
-        self._board = board.Board(
-            self._values["track"], names(self._values["lights"]), namespace=self.get_namespace()
-        )
+        self._board = board.Board(self._values, namespace=self.get_namespace())
         address = self._values["address"]
         self._server = server.DashboardServer(
             server.listen(address, self._values["port"]),
-            server.own_names() | {address.lower()} | {n.lower() for n in names(self._values["hosts"])},
+            server.own_names() | {address.lower()} | {n.lower() for n in board.names(self._values["hosts"])},
             self._values["clients"],
         )
         # The newest that is not shown yet.
@@ -114,10 +112,6 @@ class DashboardNode(Node):
     def _apply(self, changed: frozenset[str]) -> None:
         if "rate" in changed:
             self._timer.timer_period_ns = round(1e9 / self._values["rate"])
-        if "track" in changed:
-            self._board.keep_track_of(self._values["track"])
-        if "lights" in changed:
-            self._board.only_lights_of(names(self._values["lights"]))
         self._server.clients = self._values["clients"]
 
     def _on_image(self, message: Image) -> None:
@@ -138,15 +132,15 @@ class DashboardNode(Node):
             self._server.show(self._board.as_json(unix_s, self._values["stale_after"]), self._board.track)
 
     def _follow_viewers(self) -> None:
-        """Subscribe to the frames only while somebody looks, because the detector draws them for subscribers."""
-        looking = self._server.looking
-        if looking and self._images is None:
+        """Subscribe to the frames only while a page is open, because the detector draws them for subscribers."""
+        pages = self._server.pages
+        if pages and self._images is None:
             self._images = self._subscribe_frames()
-        elif not looking and self._images is not None:
+        elif not pages and self._images is not None:
             self.destroy_subscription(self._images)
             self._images = self._image = None
             self._server.frame = None
-            self._board.hide_frame()
+            self._board.show("frame", None)
 
     def _subscribe_frames(self) -> Subscription:
         return subscription(self, Image, "detector/image_annotated", self._on_image, 1)
@@ -160,7 +154,8 @@ class DashboardNode(Node):
             self._server.frame = jpeg(image, self._values["image_side"])
         except FrameError as e:
             trouble, self._server.frame = str(e), None
-        self._board.show_frame(self._shown, stamp_to_unix(image.header.stamp), trouble)
+        stamp_s = stamp_to_unix(image.header.stamp)
+        self._board.show("frame", {"number": self._shown, "stamp": stamp_s, "trouble": board.text(trouble)})
 
     # diagnostics -----------------------------------------------------------------------------------------------------
 
@@ -178,8 +173,3 @@ class DashboardNode(Node):
 
     def close(self) -> None:
         self._server.stop()
-
-
-def names(text: str) -> frozenset[str]:
-    """Split a list separated by commas into its words."""
-    return frozenset(word.strip() for word in text.split(",") if word.strip())

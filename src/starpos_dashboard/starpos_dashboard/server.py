@@ -20,14 +20,20 @@ from contextlib import suppress
 from importlib import resources
 from typing import Any
 
-from tornado.http1connection import HTTP1Connection
-from tornado.httpserver import HTTPServer
-from tornado.iostream import IOStream, StreamClosedError
-from tornado.netutil import bind_sockets
-from tornado.web import Application, HTTPError, RequestHandler
-
 from starpos.errors import StarposError, one_line
 from starpos.report.coast import COAST_FILE
+
+try:
+    from tornado.http1connection import HTTP1Connection
+    from tornado.httpserver import HTTPServer
+    from tornado.iostream import IOStream, StreamClosedError
+    from tornado.netutil import bind_sockets
+    from tornado.web import Application, HTTPError, RequestHandler
+except ImportError:
+    raise StarposError(
+        "the dashboard needs tornado, which is not installed: sudo apt install python3-tornado, "
+        "or pip install tornado"
+    ) from None
 
 HOST_NAME = re.compile(r"\[[0-9a-fA-F:.%]+\]|[A-Za-z0-9._-]+")
 HEADERS = {
@@ -44,7 +50,6 @@ HEADERS = {
 
 
 def own_names() -> frozenset[str]:
-    """The names of this machine."""
     name = socket.gethostname().lower()
     return frozenset({"localhost", name, f"{name}.local"})
 
@@ -99,16 +104,12 @@ TYPES = {
 }
 
 
-class DashboardError(StarposError):
-    """The page cannot be served."""
-
-
 def listen(address: str, port: int) -> list[socket.socket]:
-    """Bind the sockets; DashboardError that says what to do if they cannot be bound."""
+    """Bind the sockets; StarposError that says what to do if they cannot be bound."""
     try:
         return bind_sockets(port, address)
     except UnicodeError:
-        raise DashboardError(
+        raise StarposError(
             f"{address[:80]!r} is no address: set the parameter address to one of this machine's"
         ) from None
     except OSError as e:
@@ -117,7 +118,7 @@ def listen(address: str, port: int) -> list[socket.socket]:
             13: "set port above 1023",
         }
         cure = cures.get(e.errno or 0, "set the parameter address to one of this machine's")
-        raise DashboardError(
+        raise StarposError(
             f"{address}:{port} cannot be listened on ({one_line(e.strerror)}): {cure}"
         ) from None
 
@@ -166,13 +167,7 @@ class DashboardServer:
 
     @property
     def pages(self) -> int:
-        """Number of open pages."""
         return len(self.open)
-
-    @property
-    def looking(self) -> bool:
-        """Whether an open page shows the frame."""
-        return any(page.looks for page in tuple(self.open))
 
     @property
     def alive(self) -> bool:
@@ -272,7 +267,6 @@ class Reply(RequestHandler):
     def prepare(self) -> None:
         headers = self.request.headers
         if self.request.method not in ("GET", "HEAD"):
-            self.set_header("Allow", "GET, HEAD")
             raise HTTPError(405, reason="this page only shows: GET and HEAD")
         if not host_is_known(headers.get("Host", ""), self.server.names):
             raise HTTPError(
@@ -337,8 +331,8 @@ class Events(Reply):
 
     def initialize(self) -> None:
         self.news = asyncio.Event()
-        # Whether the page shows the frame, and the number of the last fix that was sent to it.
-        self.looks, self._sent_fix = self.request.query == "frame", 0
+        # Number of the last fix that was sent.
+        self._sent_fix = 0
 
     def head(self) -> None:
         self.set_header("Content-Type", "text/event-stream")

@@ -18,7 +18,7 @@ from starpos_dashboard.node import jpeg
 from starpos_interfaces.msg import Tilt
 
 NAN, INF = math.nan, math.inf
-ALL = frozenset()
+ALL = {"track": 10, "lights": ""}
 
 
 class Clock:
@@ -33,7 +33,7 @@ def told(board: Board, now_s=1000.0, slow_s=15.0) -> dict:
 
 
 def test_a_fix_comes_with_its_covariance_and_where_it_was_before():
-    b = Board(10, ALL)
+    b = Board(ALL)
     b.hear_fix(said.fix(10.0, 20.0, (4.0, 1.0, 9.0)))
     fix = told(b)["fix"]
     assert (fix["good"], fix["latitude"], fix["longitude"]) == (True, 10.0, 20.0)
@@ -50,7 +50,7 @@ def test_a_place_that_is_not_on_earth_is_no_fix(latitude, longitude):
     message = said.fix(1.0, longitude)
     message.latitude = latitude
     assert not board.position(message)["good"]
-    b = Board(10, ALL)
+    b = Board(ALL)
     b.hear_fix(message)
     assert b.track == () and "last_fix" not in told(b)
 
@@ -85,14 +85,14 @@ def test_no_attitude_is_no_heading(broken):
         message.orientation.z = message.orientation.w = 0.0
     else:
         message.orientation_covariance[0] = -1.0
-    b = Board(10, ALL)
+    b = Board(ALL)
     b.show("heading", board.heading(said.imu()))
     b.show("heading", board.heading(message))
     assert "heading" not in told(b)
 
 
 def test_nan_everywhere_is_null_everywhere():
-    b = Board(10, ALL)
+    b = Board(ALL)
     b.show("tilt", board.tilt(Tilt(x=NAN, y=INF, temperature=NAN, covariance=[NAN, NAN, NAN, INF])))
     message = said.solution()
     message.residual, message.budget[0].east, message.budget[1].heading = NAN, NAN, INF
@@ -126,7 +126,7 @@ def test_texts_are_short_and_cannot_rearrange_the_page():
 
 def test_lights_are_the_newest_of_their_name_and_bounded():
     clock = Clock()
-    b = Board(10, ALL, clock)
+    b = Board(ALL, clock)
     b.hear_diagnostics(said.diagnostics(("solver: Inputs", 0, "good")))
     clock.now += 7.0
     assert told(b)["lights"][0]["age"] == 7.0
@@ -144,7 +144,7 @@ def test_lights_are_the_newest_of_their_name_and_bounded():
 
 
 def test_only_lights_of_the_nodes_asked_for():
-    b = Board(10, frozenset({"solver"}))
+    b = Board(ALL | {"lights": "solver"})
     b.hear_diagnostics(said.diagnostics(("solver: A", 0, ""), ("wheels: B", 2, "")))
     assert [x["name"] for x in told(b)["lights"]] == ["solver: A"]
 
@@ -159,19 +159,20 @@ def test_only_lights_of_the_nodes_asked_for():
     ],
 )
 def test_the_lights_of_another_instrument_are_not_taken_for_its_own(lights, seen):
-    b = Board(10, frozenset(lights), namespace="/a")
+    b = Board(ALL | {"lights": ", ".join(lights)}, namespace="/a")
     b.hear_diagnostics(
         said.diagnostics(("/a/solver: A", 0, ""), ("/b/solver: B", 2, ""), ("solver: C", 2, ""))
     )
     assert [x["name"] for x in told(b)["lights"]] == seen
-    alone = Board(10, frozenset({"solver"}))
+    alone = Board(ALL | {"lights": "solver"})
     alone.hear_diagnostics(said.diagnostics(("/a/solver: A", 2, ""), ("solver: C", 0, "")))
     assert [x["name"] for x in told(alone)["lights"]] == ["solver: C"]
 
 
 def test_a_node_that_has_said_nothing_has_a_light_too_or_all_seems_green_without_it():
     clock = Clock()
-    b = Board(10, frozenset({"camera", "solver"}), clock)
+    values = ALL | {"lights": "camera, solver"}
+    b = Board(values, clock)
     clock.now += 6.0
     b.hear_diagnostics(said.diagnostics(("camera: Capture", 0, "")))
     lights = told(b)["lights"]
@@ -179,7 +180,7 @@ def test_a_node_that_has_said_nothing_has_a_light_too_or_all_seems_green_without
         ("camera: Capture", 0, 0.0),
         ("solver", board.STALE, 6.0),
     ]
-    b.only_lights_of(frozenset({"camera"}))
+    values["lights"] = "camera"
     assert len(told(b)["lights"]) == 1
 
 
@@ -190,17 +191,18 @@ def test_a_hostile_budget_is_cut():
 
 
 def test_the_track_forgets_its_oldest_and_counts_on():
-    b = Board(3, ALL)
+    values = ALL | {"track": 3}
+    b = Board(values)
     for k in range(5):
         b.hear_fix(said.fix(float(k), 0.0))
     assert [n for n, _, _ in b.track] == [3, 4, 5]
-    b.keep_track_of(2)
+    values["track"] = 2
     assert [n for n, _, _ in b.track] == [4, 5]
 
 
 def test_ages_are_told_on_a_clock_that_nobody_sets():
     clock = Clock()
-    b = Board(10, ALL, clock)
+    b = Board(ALL, clock)
     b.show("tilt", board.tilt(said.tilt()))
     clock.now += 3.5
     assert told(b)["tilt"]["age"] == 3.5 and told(b)["old_after"] == {"slow": 15.0, "fast": 5.0}
@@ -226,7 +228,7 @@ def test_a_broken_frame_is_one_sentence(field, value):
 
 
 def test_the_suns_way_is_that_of_the_place_and_the_day():
-    b = Board(10, ALL)
+    b = Board(ALL)
     # 2025-06-01T09:00:00
     when = 1748768400.0
     assert told(b, when)["sun"] is None
@@ -240,13 +242,13 @@ def test_the_suns_way_is_that_of_the_place_and_the_day():
 
 
 def test_at_a_gnss_place_the_sun_is_shown_too():
-    b = Board(10, ALL)
+    b = Board(ALL)
     b.show("gnss", board.gnss(said.gnss()))
     assert len(told(b, 1748768400.0)["sun"]) == 73
 
 
 def test_at_a_site_by_parameter_the_sun_is_shown_before_any_fix():
-    b, when = Board(10, ALL), 1748768400.0
+    b, when = Board(ALL), 1748768400.0
     diagnostics = said.diagnostics(("solver: Solution", 0, "heading by the Sun"))
     site = (("site latitude (deg)", "48.0"), ("site longitude (deg)", "11.0"))
     diagnostics.status[0].values = [KeyValue(key=key, value=value) for key, value in site]

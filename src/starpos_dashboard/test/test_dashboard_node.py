@@ -7,6 +7,7 @@ import socket
 import sys
 import urllib.request
 from contextlib import closing
+from importlib import import_module
 
 import pytest
 import said
@@ -79,11 +80,10 @@ def test_no_address_is_not_every_address(made, address):
 
 
 def test_without_tornado_it_says_how_to_install_it(monkeypatch):
-    from starpos_dashboard.main import make_nodes
-
-    monkeypatch.setitem(sys.modules, "tornado", None)
+    monkeypatch.setitem(sys.modules, "tornado.http1connection", None)
+    monkeypatch.delitem(sys.modules, "starpos_dashboard.server", raising=False)
     with pytest.raises(StarposError, match="sudo apt install python3-tornado"):
-        next(make_nodes())
+        import_module("starpos_dashboard.server")
 
 
 def test_an_address_others_reach_is_a_warning_and_loopback_is_none(start, listener):
@@ -105,7 +105,7 @@ def test_it_ends_at_once_with_pages_open_and_hung(start, listener, signals):
         closing(socket.create_connection(address)) as hung,
         closing(socket.create_connection(address)) as mute,
     ):
-        hung.sendall(b"GET /events?frame HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        hung.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
         mute.sendall(b"GET /")
         listener.wait(lambda: {"pages", "1"} <= set(words(listener)))
         status, output = process.end(*signals)
@@ -149,7 +149,7 @@ def test_hostile_messages_are_taken_in_its_stride(start, listener):
     broken = said.image(64, 40)
     broken.width = 2**31
     flood = said.diagnostics(*((f"\x1b[2J\u202en{k}: T", 200, "<script>" * 500) for k in range(500)))
-    with urllib.request.urlopen(f"http://{host}:{port}/events?frame", timeout=WAIT_S) as page:
+    with urllib.request.urlopen(f"http://{host}:{port}/events", timeout=WAIT_S) as page:
         listener.wait(lambda: image.get_subscription_count() == 1)
         seen = []
 

@@ -169,15 +169,6 @@ def test_a_viewer_gets_the_state_and_of_the_track_what_it_has_not(server):
     wait(server, lambda: server.pages == 0)
 
 
-def test_frames_are_wanted_only_while_a_page_shows_them(server):
-    with closing(Viewer(server)):
-        wait(server, lambda: server.pages == 1)
-        assert not server.looking
-        with closing(Viewer(server, "/events?frame")):
-            wait(server, lambda: server.looking)
-        wait(server, lambda: not server.looking)
-
-
 def test_the_newest_frame_is_served_and_gone_when_it_is_taken_away(server):
     server.frame = b"\xff\xd8jpeg"
     status, headers, body = ask(server, "/frame.jpg?7")
@@ -264,15 +255,16 @@ def test_junk_ends_its_own_connection_only(server, junk):
 # tornado leaves the socket that it could not bind to the garbage collector
 @pytest.mark.filterwarnings("ignore:Exception ignored in. <socket:pytest.PytestUnraisableExceptionWarning")
 def test_a_port_in_use_is_said_in_a_sentence(server):
-    from starpos_dashboard.server import DashboardError, listen
+    from starpos.errors import StarposError
+    from starpos_dashboard.server import listen
 
-    with pytest.raises(DashboardError, match=f"127.0.0.1:{server.port} .*another program has this port"):
+    with pytest.raises(StarposError, match=f"127.0.0.1:{server.port} .*another program has this port"):
         listen("127.0.0.1", server.port)
-    with pytest.raises(DashboardError, match="set the parameter address"):
+    with pytest.raises(StarposError, match="set the parameter address"):
         listen("192.0.2.1", 0)
-    with pytest.raises(DashboardError, match="set the parameter address"):
+    with pytest.raises(StarposError, match="set the parameter address"):
         listen("no.such.name.invalid", 0)
-    with pytest.raises(DashboardError, match="is no address: set the parameter address"):
+    with pytest.raises(StarposError, match="is no address: set the parameter address"):
         listen("x" * 5000, 0)
 
 

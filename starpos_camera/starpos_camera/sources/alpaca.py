@@ -78,6 +78,9 @@ class AlpacaCamera:
         self._address, self._place = address, f"/api/v1/camera/{number}"
         self._calls = count(1)
 
+    def release(self) -> None:
+        """Nothing is kept open between two calls."""
+
     def get(self, member: str) -> Any:
         """Value of a member; MemberError if the camera has none."""
         return self._json("GET", member, {})["Value"]
@@ -248,7 +251,6 @@ class Alpaca(DeviceSource[AlpacaCamera]):
         return "" if has == gain else f"its gain is {has}, though {gain:g} was set."
 
     def _wait(self, camera: AlpacaCamera, exposure_s: float) -> None:
-        """Wait until the picture is there."""
         begin = time.monotonic()
         while not camera.get("imageready"):
             left_s = begin + exposure_s - time.monotonic()

@@ -20,7 +20,7 @@ from starpos.frames.encodings import MOSAICS
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, decoded
-from starpos_camera.sources.timing import dated, middle_of_commanded, middle_of_started
+from starpos_camera.sources.timing import dated, dated_by_command, dated_by_start
 from starpos_interfaces.msg import Capture
 
 # Between a camera's time and the moment of the light, where the clocks are related.
@@ -29,28 +29,10 @@ TIMESTAMP_STDDEV_S = 1e-3
 TOLERANCE_S = 5e-3
 
 
-def on_host_clock(
-    camera_s: float,
-    relation: tuple[float, float] | None,
-    exposure_s: float,
-    commanded_s: float | None,
-    received_s: float,
-) -> tuple[float, float] | None:
-    """The camera's time of a frame on the node's clock (Unix s), and its error (s); None: the clocks are not related.
-
-    relation: of `clock_relation`; the other times are `stamp_of_camera`'s. A camera whose clock cannot be read may keep
-    UTC (PTP), but its error is not stated. Exposure and stamp then lie anywhere between trigger and arrival.
-    """
-    if relation is not None:
-        return camera_s + relation[0], relation[1]
-    if commanded_s is None or not commanded_s <= camera_s <= received_s + TOLERANCE_S:
-        return None
-    return camera_s, max(0.0, received_s - commanded_s - exposure_s) / math.sqrt(3)
-
-
 def stamp_of_camera(
     frame: Frame,
-    at: tuple[float, float] | None,
+    camera_s: float | None,
+    relation: tuple[float, float] | None,
     exposure_s: float,
     commanded_s: float | None,
     received_s: float,
@@ -58,19 +40,25 @@ def stamp_of_camera(
 ) -> CapturedFrame:
     """Date a frame by the better time: the camera's, or that of command or arrival.
 
-    at           of `on_host_clock`; None: not known
+    camera_s     the frame's time on the camera's clock; None: not reported
+    relation     of `clock_relation`; None: the camera's clock cannot be read
     commanded_s  Unix time just before the software trigger; None: a line has triggered
     received_s   arrival of the frame's first or last data, Unix time
     """
     frame, half_s = replace(frame, exposure_s=exposure_s), exposure_s / 2
     if commanded_s is None:
-        middle = middle_of_started(received_s - exposure_s, 0.0, exposure_s, values)
-        otherwise = dated(frame, *middle, Capture.DRIVER)
+        otherwise = dated_by_start(frame, received_s - exposure_s, 0.0, values)
     else:
-        otherwise = dated(frame, *middle_of_commanded(commanded_s, exposure_s, values), Capture.COMMAND)
-    if at is None:
+        otherwise = dated_by_command(frame, commanded_s, values)
+    if camera_s is None:
         return otherwise
-    at_s, stddev_s = at[0], math.hypot(at[1], TIMESTAMP_STDDEV_S)
+    if relation is None:
+        # It may keep UTC (PTP), with an error that is not stated: exposure and stamp then lie anywhere between trigger
+        # and arrival.
+        if commanded_s is None or not commanded_s <= camera_s <= received_s + TOLERANCE_S:
+            return otherwise
+        relation = 0.0, max(0.0, received_s - commanded_s - exposure_s) / math.sqrt(3)
+    at_s, stddev_s = camera_s + relation[0], math.hypot(relation[1], TIMESTAMP_STDDEV_S)
     earliest_s = (-math.inf if commanded_s is None else commanded_s) + half_s - TOLERANCE_S
     latest_s = received_s - half_s + TOLERANCE_S
     middles_s = [
@@ -228,7 +216,6 @@ class AravisCamera:
         return region.width, region.height
 
     def _set_format(self, wanted: str) -> str:
-        """Set the pixel format; return its encoding."""
         offered = self.camera.dup_available_pixel_formats_as_strings()
         if wanted and (wanted not in FORMATS or wanted not in offered):
             raise CaptureError(
@@ -324,9 +311,6 @@ class Aravis(DeviceSource[AravisCamera]):
     def _open(self) -> AravisCamera:
         return AravisCamera(self._values)
 
-    def _close(self, device: AravisCamera) -> None:
-        device.release()
-
     def _explain(self, error: Exception) -> str:
         # Aravis reports everything as GLib.Error, and a camera's strange answers cause others.
         if isinstance(error, StarposError):
@@ -345,10 +329,9 @@ class Aravis(DeviceSource[AravisCamera]):
         frame, camera_s, arrival_s = self._wait(camera, asked_s, exposure_s)
         # The arrival by the node's clock, which need not be the system's.
         received_s = self._now() - (time.time() - arrival_s)
-        times = exposure_s, commanded_s if triggers else None, received_s
         relation = clock_relation(camera.camera, self._now)
-        at = None if camera_s is None else on_host_clock(camera_s, relation, *times)
-        taken = stamp_of_camera(frame, at, *times, self._values)
+        times = exposure_s, commanded_s if triggers else None, received_s
+        taken = stamp_of_camera(frame, camera_s, relation, *times, self._values)
         return replace(taken, remark=taken.remark or remark)
 
     def _wait(

@@ -188,8 +188,6 @@ class Files(FrameSource):
             return (
                 "files.watch looks into one folder: the pattern of files.path must be in its last part only."
             )
-        if watch and (lack := _no_home(path)):
-            return lack
         if values["files.exif"]:
             return missing("exifread", "exifread")
         if not math.isnan(values["files.exif_utc_offset"]):
@@ -199,9 +197,12 @@ class Files(FrameSource):
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
         super().__init__(values, now)
         self.hardware_id = self._path = values["files.path"]
-        self._loop = values["files.loop"]
-        self._restamp = values["files.restamp"]
-        self._clock = camera_clock(values)
+        # Of the camera that wrote the files' EXIF; None: it is not believed.
+        self._clock: CameraClock | None = None
+        if values["files.exif"]:
+            offset_h = values["files.exif_utc_offset"]
+            known_h = None if math.isnan(offset_h) else offset_h
+            self._clock = CameraClock(known_h, values["files.exif_clock_stddev"])
         # The files that this round has left, last first; None before the first round.
         self._queue: list[Path] | None = None
         self._bad: set[Path] = set()
@@ -221,8 +222,7 @@ class Files(FrameSource):
                 )
             if next(find_files(self._path), None) is None:
                 return f"{self._path}: there are no frames here; check files.path."
-        except (OSError, RuntimeError) as error:
-            # There is no permission, or no home of such a user.
+        except OSError as error:
             return f"{self._path}: it cannot be listed ({error}); check files.path."
         return None
 
@@ -242,7 +242,7 @@ class Files(FrameSource):
         frame = read_frame(path, self._clock)
         if not isinstance(frame, Frame):
             raise FrameError(f"{path}: it is a list of stars, not a frame; give FITS, TIFF, PNG or raw.")
-        if self._restamp:
+        if self._values["files.restamp"]:
             # The exposure is taken to have just ended, so that the tilts of its time are there.
             middle_s = self._now() - (frame.exposure_s or 0.0) / 2
             frame = replace(frame, mid_unix_s=middle_s, stamp_stddev_s=0.0)
@@ -282,7 +282,7 @@ class Files(FrameSource):
         return exposure
 
     def _next_round(self) -> list[Path]:
-        if self._queue is not None and not self._loop:
+        if self._queue is not None and not self._values["files.loop"]:
             raise SourceEnded(f"all frames of {self._path} are played.")
         if lack := self.lacking():
             raise FrameError(lack)
@@ -293,25 +293,9 @@ class Files(FrameSource):
         return good[::-1]
 
 
-def camera_clock(values: Mapping) -> CameraClock | None:
-    """Make the clock of the camera that wrote the files' EXIF; None unless files.exif is set."""
-    if not values["files.exif"]:
-        return None
-    offset_h = values["files.exif_utc_offset"]
-    return CameraClock(None if math.isnan(offset_h) else offset_h, values["files.exif_clock_stddev"])
-
-
-def _no_home(path: str) -> str | None:
-    try:
-        split(path)
-    except RuntimeError as error:
-        return f"files.path {path}: {error}; check it."
-    return None
-
-
 def split(path: str) -> tuple[Path, str]:
     """Split a path into the folder to watch and the pattern of names, '' for all frames."""
-    place = Path(path).expanduser()
+    place = Path(os.path.expanduser(path))
     return (place.parent, place.name) if glob.has_magic(place.name) else (place, "")
 
 
@@ -324,7 +308,7 @@ def fits(name: str, pattern: str) -> bool:
 
 def find_files(path: str) -> Iterator[Path]:
     """Find the frames in a folder, or all files that a pattern matches, in no order; none if there is no such place."""
-    place = Path(path).expanduser()
+    place = Path(os.path.expanduser(path))
     if place.is_dir():
         found = (file for file in place.iterdir() if fits(file.name, ""))
     else:

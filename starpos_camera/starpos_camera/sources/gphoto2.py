@@ -13,8 +13,7 @@ from typing import Any
 
 from starpos.frames.reading import RAW, decode_frame
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, missing
-from starpos_camera.sources.timing import dated, middle_of_commanded
-from starpos_interfaces.msg import Capture
+from starpos_camera.sources.timing import dated_by_command
 
 # Largest difference of an exposure or a gain from one that the camera has, as a share.
 TOLERANCE = 0.05
@@ -89,8 +88,8 @@ class Gphoto2Camera:
         if (widget := self.setting(name)) is not None:
             self.choose(widget, next((c for c in self.choices(widget) if re.search(pattern, c, re.I)), None))
 
-    def set_exposure(self, name: str, wanted_s: float | None) -> tuple[float, bool]:
-        """Set the shutter (None: leave it); return the exposure in s, and whether the shutter has to be held open."""
+    def set_exposure(self, name: str, wanted_s: float | None) -> float:
+        """Set the shutter (None: leave it); return the exposure in s."""
         widget = self.setting(name)
         if widget is None:
             raise CaptureError(f"it has no setting {name!r}: give its own in gphoto2.shutter_setting.")
@@ -98,15 +97,11 @@ class Gphoto2Camera:
             exposure_s = seconds(widget.get_value())
             if exposure_s is None:
                 raise CaptureError(f"its {name} stands at {widget.get_value()!r}: set `exposure`.")
-            return exposure_s, False
+            return exposure_s
         speeds = {c: s for c in self.choices(widget) if (s := seconds(c)) is not None}
-        longest_s = max(speeds.values(), default=math.inf)
-        if wanted_s > (1 + TOLERANCE) * longest_s and self.setting("bulb") is not None:
-            self.choose(widget, next((c for c in self.choices(widget) if "bulb" in c.lower()), None))
-            return wanted_s, True
         choice = nearest(speeds, wanted_s, f"{name} of {wanted_s:g} s")
         self.choose(widget, choice)
-        return speeds[choice], False
+        return speeds[choice]
 
     def set_gain(self, name: str, wanted: float) -> None:
         widget = self.setting(name)
@@ -118,20 +113,6 @@ class Gphoto2Camera:
     def trigger(self) -> None:
         """Begin an exposure; with some cameras this returns only at its end."""
         self._camera.trigger_capture()
-
-    def hold_open(self, exposure_s: float) -> float:
-        """Hold the shutter open; return for how long it was open (s)."""
-        bulb = self._camera.get_single_config("bulb")
-        begin = time.monotonic()
-        bulb.set_value(1)
-        self._camera.set_single_config("bulb", bulb)
-        try:
-            self._closing.wait(max(0.0, begin + exposure_s - time.monotonic()))
-        finally:
-            held_s = time.monotonic() - begin
-            bulb.set_value(0)
-            self._camera.set_single_config("bulb", bulb)
-        return held_s
 
     def drain(self) -> None:
         """Drop the events from before, because some cameras stop when they pile up."""
@@ -166,7 +147,6 @@ class Gphoto2Camera:
         return found
 
     def fetch(self, path: str) -> bytes:
-        """Fetch the bytes of a file."""
         place = str(PurePosixPath(path).parent), PurePosixPath(path).name
         size = self._camera.file_get_info(*place).file.size
         if not 0 < size <= MAX_FILE_BYTES:
@@ -263,9 +243,6 @@ class Gphoto2(DeviceSource[Gphoto2Camera]):
         which = filter(None, (values["gphoto2.model"], values["gphoto2.port"]))
         self.hardware_id = " ".join(("gphoto2", *which))
 
-    def _close(self, device: Gphoto2Camera) -> None:
-        device.release()
-
     def _explain(self, error: Exception) -> str | None:
         import gphoto2
 
@@ -285,28 +262,22 @@ class Gphoto2(DeviceSource[Gphoto2Camera]):
 
     def _expose(self, camera: Gphoto2Camera, settings: CaptureSettings) -> CapturedFrame:
         camera.drain()
-        set_s, bulb = camera.set_exposure(self._values["gphoto2.shutter_setting"], settings.exposure_s)
+        set_s = camera.set_exposure(self._values["gphoto2.shutter_setting"], settings.exposure_s)
         if settings.gain is not None:
             camera.set_gain(self._values["gphoto2.iso_setting"], settings.gain)
         commanded_s = self._now()
-        if bulb:
-            set_s = camera.hold_open(set_s)
-        else:
-            camera.trigger()
+        camera.trigger()
         files = camera.files(set_s)
         file = next((f for f in files if PurePosixPath(f).suffix.lower() in RAW), files[0])
         data = camera.fetch(file)
         remark = "" if self._values["gphoto2.keep"] else self._delete(camera, files)
         frame = decode_frame(data, file)
-        told_s = frame.exposure_s
-        exposure_s = set_s if bulb or told_s is None else told_s
+        exposure_s = set_s if frame.exposure_s is None else frame.exposure_s
         if abs(math.log(exposure_s / set_s)) > TOLERANCE:
             remark = f"it says that it exposed for {exposure_s:g} s, though its shutter stood at {set_s:g} s."
-        mid_s, stddev_s = middle_of_commanded(commanded_s, exposure_s, self._values)
-        if not bulb:
-            stddev_s = math.hypot(stddev_s, named_off_s(exposure_s) / 2)
-        taken = dated(replace(frame, exposure_s=exposure_s), mid_s, stddev_s, Capture.COMMAND)
-        return replace(taken, remark=remark)
+        taken = dated_by_command(replace(frame, exposure_s=exposure_s), commanded_s, self._values)
+        stddev_s = math.hypot(taken.frame.stamp_stddev_s, named_off_s(exposure_s) / 2)
+        return replace(taken, frame=replace(taken.frame, stamp_stddev_s=stddev_s), remark=remark)
 
     def _delete(self, camera: Gphoto2Camera, files: list[str]) -> str:
         """Delete the files of this exposure in the camera; return a sentence if that failed, otherwise ''."""

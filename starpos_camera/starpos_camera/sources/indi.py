@@ -8,7 +8,6 @@ import socket
 import threading
 import time
 import xml.etree.ElementTree as ET
-import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -44,7 +43,6 @@ class Vector:
     asked: bool = False
 
     def number(self, member: str) -> float | None:
-        """Value of a member; None without one."""
         return _number(self.members.get(member))
 
 
@@ -80,7 +78,7 @@ class IndiDevice:
         self._depth = self._pending = 0
         self._ask()
 
-    def close(self) -> None:
+    def release(self) -> None:
         """Leave the server once it has read all that was sent to it."""
         end = time.monotonic() + LINK_S
         with suppress(OSError):
@@ -160,24 +158,19 @@ class IndiDevice:
         self._pending += len(data)
         self._parser.feed(data)
         try:
-            self._take_all()
+            for event, element in self._parser.read_events():
+                self._depth += 1 if event == "start" else -1
+                # An element has come whole.
+                if self._depth == 0:
+                    self._take(element)
+                    self._root.clear()
+                    self._pending = 0
         except ET.ParseError as error:
             raise CaptureError(f"the INDI server sends what is no XML ({one_line(error)}).") from None
         if self._pending > ELEMENT_MAX:
             raise CaptureError("the INDI server sends more than any frame has.")
 
-    def _take_all(self) -> None:
-        """Take the elements that have come whole; ParseError for what is no XML."""
-        events: Any = self._parser.read_events()
-        for event, element in events:
-            self._depth += 1 if event == "start" else -1
-            if self._depth == 0:
-                self._take(element)
-                self._root.clear()
-                self._pending = 0
-
     def _take(self, element: ET.Element) -> None:
-        """Note what an element of the server says."""
         kind, name = element.tag, element.get("name", "")
         device = element.get("device", "")
         if kind.startswith("def"):
@@ -232,6 +225,9 @@ SWITCHES = (
     ("UPLOAD_MODE", "UPLOAD_CLIENT"),
     ("CCD_TRANSFER_FORMAT", "FORMAT_FITS"),
     ("CCD_FRAME_TYPE", "FRAME_LIGHT"),
+    # By its newer and its older name.
+    ("CCD_COMPRESSION", "INDI_DISABLED"),
+    ("CCD_COMPRESSION", "CCD_RAW"),
 )
 # Drivers have one or the other.
 GAINS = (("CCD_GAIN", "GAIN"), ("CCD_CONTROLS", "Gain"))
@@ -288,24 +284,15 @@ def set_up(device: IndiDevice, exposure_s: float, gain: float | None, binning: i
         if width and height:
             _set_numbers(device, "CCD_FRAME", X=0.0, Y=0.0, WIDTH=width, HEIGHT=height)
     if gain is not None:
-        vector, member = _gain_of(device)
+        found = [(v, m) for v, m in GAINS if m in device.vector(v).members]
+        if not found:
+            raise CaptureError("it has no gain to be set: leave `gain` unset.")
+        vector, member = found[0]
         _check_limits(device, vector, member, gain, "`gain`")
         if device.vector(vector).number(member) != gain:
             # The driver may round the gain to one that the camera has.
             _set(device, vector, **{member: repr(float(gain))})
     _check_limits(device, "CCD_EXPOSURE", "CCD_EXPOSURE_VALUE", exposure_s, "`exposure` (s)")
-
-
-def _gain_of(device: IndiDevice) -> tuple[str, str]:
-    """The vector and member that set the gain; CaptureError if none comes."""
-
-    def there() -> list[tuple[str, str]]:
-        return [(v, m) for v, m in GAINS if m in device.vector(v).members]
-
-    # A driver defines its properties one after the other, and nothing says which is the last.
-    if not device.until(there, ANSWER_S):
-        raise CaptureError("it has no gain to be set: leave `gain` unset.")
-    return there()[0]
 
 
 def expose(device: IndiDevice, exposure_s: float, readout_s: float) -> ET.Element:
@@ -396,15 +383,12 @@ class Indi(DeviceSource[IndiDevice]):
     def _open(self) -> IndiDevice:
         return IndiDevice(self._host, self._port, self._name, self._closing)
 
-    def _close(self, device: IndiDevice) -> None:
-        device.close()
-
     def _expose(self, device: IndiDevice, settings: CaptureSettings) -> CapturedFrame:
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
         # What has come since the last frame: perhaps the end of the connection.
         device.until(lambda: False, DRAIN_S)
         if device.lost:
-            device.close()
+            device.release()
             device = self._device = self._open()
         check_there(device)
         connect_camera(device)
@@ -412,7 +396,7 @@ class Indi(DeviceSource[IndiDevice]):
         commanded_s = self._now()
         blob = expose(device, exposure_s, self._values["indi.readout"])
         ready_s = self._now()
-        frame, header = decode_fits(_unpacked(blob), "its frame")
+        frame, header = decode_fits(_fits_of(blob), "its frame")
         if frame.untimed:
             raise CaptureError(f"the header of its frame cannot be used: {frame.untimed}.")
         told, clock_s = str(header.get("DATE-OBS", "")), clock_stddev_of("indi", self._host, self._values)
@@ -420,26 +404,17 @@ class Indi(DeviceSource[IndiDevice]):
         return dated_by_driver(frame, told, clock_s, exposures_s, between_s, self._values)
 
 
-def _unpacked(blob: ET.Element) -> bytes:
-    """Unpack the FITS file of a BLOB, and empty it; CaptureError if it is of another format or incomplete."""
+def _fits_of(blob: ET.Element) -> bytes:
+    """Take the FITS file out of a BLOB, which is emptied; CaptureError if it is of another format or incomplete."""
     kind = blob.get("format", "")
     try:
-        # The stated size is that before compression.
         data, size = base64.b64decode(blob.text or ""), int(blob.get("size", ""))
     except (binascii.Error, ValueError) as error:
         raise CaptureError(f"its frame is no BLOB ({one_line(error)}).") from None
     blob.clear()
     if not 0 < size <= BLOB_MAX:
         raise CaptureError(f"its frame claims {size} bytes; a frame has at most {BLOB_MAX}.")
-    # astropy unpacks this format.
-    if kind == ".fits.fz":
-        return data
-    if kind == ".fits.z":
-        try:
-            data = zlib.decompressobj().decompress(data, size + 1)
-        except zlib.error as error:
-            raise CaptureError(f"its frame cannot be unpacked ({one_line(error)}).") from error
-    elif kind != ".fits":
+    if kind != ".fits":
         raise CaptureError(f"it sends {one_line(kind)!r}, not FITS: set its driver's transfer format.")
     if len(data) != size:
         raise CaptureError(f"its frame has {len(data)} of {size} bytes; it is left out.")

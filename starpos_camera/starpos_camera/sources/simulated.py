@@ -48,7 +48,6 @@ class Simulated(FrameSource):
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
         super().__init__(values, now)
         self._rng = np.random.default_rng(values["simulated.seed"])
-        self._scene = scene_from(values)
         self.hardware_id = "simulated sky"
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
@@ -57,13 +56,10 @@ class Simulated(FrameSource):
 
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
         start = self._now() - exposure_s
-        scene = self._scene
+        scene = scene_from(self._values)
         stars = expose(scene, load_catalogue(), start, exposure_s, self._rng)
         frame = render(scene, stars, start, exposure_s, self._rng)
         return CapturedFrame(replace(frame, stamp_stddev_s=STAMP_ROUNDING_S), Capture.SIMULATED, scene.camera)
-
-    def update(self, values: Mapping) -> None:
-        self._scene = scene_from(values)
 
 
 def air_from(values: Mapping) -> Atmosphere:
@@ -76,7 +72,6 @@ def air_from(values: Mapping) -> Atmosphere:
 
 
 def scene_from(values: Mapping) -> "Scene":
-    """Make the scene of the node's parameters."""
     from starpos.simulation.scene import scene_of
 
     return scene_of(

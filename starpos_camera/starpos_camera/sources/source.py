@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -59,7 +59,7 @@ class CapturedFrame:
 
 
 class FrameSource:
-    """A camera, made as SourceClass(values, now): the node's parameters, and its clock in Unix seconds.
+    """A camera, made as SourceClass(values, now): the node's parameters as they are at any time, its clock in Unix s.
 
     Making one opens no device and cannot fail for lack of one. `capture` opens the device if it is not open, so a
     device may come, go and come back. All methods except `close` and `capture` return at once. A module imports the
@@ -94,15 +94,18 @@ class FrameSource:
         """
         raise NotImplementedError
 
-    def update(self, values: Mapping) -> None:
-        """Apply changed parameters; may be called while `capture` runs."""
-        self._values = values
-
     def close(self) -> None:
         """Release the device; called once. A `capture` that still runs ends soon."""
 
 
-D = TypeVar("D")
+class Device(Protocol):
+    """What a DeviceSource keeps open."""
+
+    def release(self) -> object:
+        """Give the device up, which may have gone."""
+
+
+D = TypeVar("D", bound=Device)
 
 
 class DeviceSource(FrameSource, Generic[D]):
@@ -141,7 +144,7 @@ class DeviceSource(FrameSource, Generic[D]):
     def _release(self) -> None:
         device, self._device = self._device, None
         if device is not None:
-            self._close(device)
+            device.release()
 
     def _open(self) -> D:
         """Open the device; CaptureError if it is not there."""
@@ -149,9 +152,6 @@ class DeviceSource(FrameSource, Generic[D]):
 
     def _expose(self, device: D, settings: CaptureSettings) -> CapturedFrame:
         raise NotImplementedError
-
-    def _close(self, device: D) -> None:
-        """Give the device up, which may have gone."""
 
     def _explain(self, error: Exception) -> str | None:
         """Say in a sentence what an error means; None for a defect, which the node reports as one."""

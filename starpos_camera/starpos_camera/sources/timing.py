@@ -59,7 +59,7 @@ def dated_by_driver(
             f"it says that it has exposed for {exposure_s:g} s, when {wanted_s:g} s were asked."
         )
     frame = replace(frame, exposure_s=exposure_s)
-    commanded = dated(frame, *middle_of_commanded(commanded_s, exposure_s, values), Capture.COMMAND)
+    commanded = dated_by_command(frame, commanded_s, values)
     start = read_utc(told)
     if start is None or math.isnan(clock_stddev_s):
         return commanded
@@ -71,23 +71,24 @@ def dated_by_driver(
     if max(commanded_s - start_s, start_s + exposure_s - ready_s) > tolerance_s:
         off = f"its times of exposures are off by more than {tolerance_s:.2g} s and not used"
         return replace(commanded, remark=f"{off}; set its machine's clock, to UTC.")
-    mid_s, stddev_s = middle_of_started(start_s, resolution_s, exposure_s, values)
-    if math.hypot(stddev_s, clock_stddev_s) > commanded.frame.stamp_stddev_s:
-        return commanded
-    return dated(frame, mid_s, stddev_s, Capture.DRIVER, clock_stddev_s)
+    started = dated_by_start(frame, start_s, resolution_s, values, clock_stddev_s)
+    error_s = math.hypot(started.frame.stamp_stddev_s, clock_stddev_s)
+    return commanded if error_s > commanded.frame.stamp_stddev_s else started
 
 
-def middle_of_commanded(commanded_s: float, exposure_s: float, values: Mapping) -> tuple[float, float]:
-    """Middle (Unix time) and its standard deviation (s) from the time of the command alone."""
-    return commanded_s + values["command_lag"] + exposure_s / 2, values["command_lag_stddev"]
+def dated_by_command(frame: Frame, commanded_s: float, values: Mapping) -> CapturedFrame:
+    """Date a frame, whose exposure is known, by the time of the command alone."""
+    middle_s = commanded_s + values["command_lag"] + (frame.exposure_s or 0.0) / 2
+    return dated(frame, middle_s, values["command_lag_stddev"], Capture.COMMAND)
 
 
-def middle_of_started(
-    start_s: float, resolution_s: float, exposure_s: float, values: Mapping
-) -> tuple[float, float]:
-    """Middle and its standard deviation from the start that the driver reports, rounded or cut at its resolution."""
+def dated_by_start(
+    frame: Frame, start_s: float, resolution_s: float, values: Mapping, clock_stddev_s: float = 0.0
+) -> CapturedFrame:
+    """Date a frame, whose exposure is known, by the start that is reported, rounded or cut at its resolution."""
     stddev_s = math.hypot(values["driver_lag_stddev"], 1.5 * resolution_s / math.sqrt(12))
-    return start_s + values["driver_lag"] + resolution_s / 4 + exposure_s / 2, stddev_s
+    middle_s = start_s + values["driver_lag"] + resolution_s / 4 + (frame.exposure_s or 0.0) / 2
+    return dated(frame, middle_s, stddev_s, Capture.DRIVER, clock_stddev_s)
 
 
 def read_utc(text: str) -> tuple[float, float] | None:

@@ -98,9 +98,6 @@ class Video(DeviceSource["VideoCapture"]):
             return f"{self.hardware_id}: it is not there; plug it in, or correct video.device."
         return None
 
-    def _close(self, device: "VideoCapture") -> None:
-        device.release()
-
     def _expose(self, device: "VideoCapture", settings: CaptureSettings) -> CapturedFrame:
         with quiet_opencv() as cv2:
             exposure_s, remark = self._settings(cv2, device, settings)

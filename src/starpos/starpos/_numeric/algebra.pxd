@@ -62,15 +62,50 @@ cdef inline void turn_by(const double *v, double *rotation) noexcept nogil:
             rotation[3 * i + j] = after[i]
 
 
+cdef inline void diagonalised(double *a, double *vector, int n, bint graded) noexcept nogil:
+    """Make a symmetric matrix a (n, n) diagonal, and set the columns of vector (n, n) to its eigenvectors.
+
+    By Jacobi's rotations (Golub and Van Loan, Matrix Computations (2013), section 8.5).
+    graded: small eigenvalues beside large ones keep their digits, as of covariances.
+    """
+    cdef double off, angle, t, c, s, one, other, size
+    cdef int i, j, k, sweep
+    for i in range(n * n):
+        vector[i] = 1.0 if i % (n + 1) == 0 else 0.0
+    for sweep in range(30):
+        off = 0.0
+        for i in range(n - 1):
+            for j in range(i + 1, n):
+                size = sqrt(fabs(a[n * i + i] * a[n * j + j])) if graded else fabs(a[n * i + i]) + fabs(a[n * j + j])
+                if fabs(a[n * i + j]) <= 1e-17 * size or a[n * i + j] == 0.0:
+                    continue
+                off += fabs(a[n * i + j])
+                angle = (a[n * j + j] - a[n * i + i]) / (2 * a[n * i + j])
+                t = (1.0 if angle >= 0 else -1.0) / (fabs(angle) + sqrt(angle * angle + 1))
+                c = 1 / sqrt(t * t + 1)
+                s = t * c
+                for k in range(n):
+                    one, other = a[n * k + i], a[n * k + j]
+                    a[n * k + i], a[n * k + j] = c * one - s * other, s * one + c * other
+                for k in range(n):
+                    one, other = a[n * i + k], a[n * j + k]
+                    a[n * i + k], a[n * j + k] = c * one - s * other, s * one + c * other
+                for k in range(n):
+                    one, other = vector[n * k + i], vector[n * k + j]
+                    vector[n * k + i], vector[n * k + j] = c * one - s * other, s * one + c * other
+        if off == 0.0:
+            break
+
+
 cdef inline void best_rotation(const double *b, double *rotation) noexcept nogil:
     """Set rotation (3, 3) to the one nearest to b (3, 3), the sum of target times source transposed over pairs of vectors.
 
-    Horn's quaternion (1987, J. Opt. Soc. Am. A 4, 629): the eigenvector of a 4 x 4 matrix, by Jacobi's rotations.
+    Horn's quaternion (1987, J. Opt. Soc. Am. A 4, 629): an eigenvector of a 4 x 4 matrix.
     """
     cdef double[4][4] n
     cdef double[4][4] vector
-    cdef double off, angle, t, c, s, one, other, w, x, y, z
-    cdef int i, j, k, sweep, best = 0
+    cdef double w, x, y, z
+    cdef int i, best = 0
     n[0][0] = b[0] + b[4] + b[8]
     n[1][1] = b[0] - b[4] - b[8]
     n[2][2] = -b[0] + b[4] - b[8]
@@ -81,31 +116,7 @@ cdef inline void best_rotation(const double *b, double *rotation) noexcept nogil
     n[1][2] = n[2][1] = b[3] + b[1]
     n[1][3] = n[3][1] = b[2] + b[6]
     n[2][3] = n[3][2] = b[7] + b[5]
-    for i in range(4):
-        for j in range(4):
-            vector[i][j] = 1.0 if i == j else 0.0
-    for sweep in range(20):
-        off = 0.0
-        for i in range(3):
-            for j in range(i + 1, 4):
-                if fabs(n[i][j]) <= 1e-17 * (fabs(n[i][i]) + fabs(n[j][j])):
-                    continue
-                off += fabs(n[i][j])
-                angle = (n[j][j] - n[i][i]) / (2 * n[i][j])
-                t = (1.0 if angle >= 0 else -1.0) / (fabs(angle) + sqrt(angle * angle + 1))
-                c = 1 / sqrt(t * t + 1)
-                s = t * c
-                for k in range(4):
-                    one, other = n[k][i], n[k][j]
-                    n[k][i], n[k][j] = c * one - s * other, s * one + c * other
-                for k in range(4):
-                    one, other = n[i][k], n[j][k]
-                    n[i][k], n[j][k] = c * one - s * other, s * one + c * other
-                for k in range(4):
-                    one, other = vector[k][i], vector[k][j]
-                    vector[k][i], vector[k][j] = c * one - s * other, s * one + c * other
-        if off == 0.0:
-            break
+    diagonalised(&n[0][0], &vector[0][0], 4, False)
     for i in range(1, 4):
         if n[i][i] > n[best][best]:
             best = i

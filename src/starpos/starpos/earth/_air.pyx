@@ -9,8 +9,8 @@ import numpy as np
 from starpos._numeric.algebra cimport length
 
 
-cdef class Air:
-    """Refraction a tan z + b tan^3 z, in rad, at the observed zenith distance z, as `refraction.Refraction` has it.
+cdef class Refraction:
+    """Refraction a tan z + b tan^3 z, in rad, at the observed zenith distance z (ERFA's eraRefco).
 
     least_up: cosine of the zenith distance beyond which it does not grow.
     """
@@ -19,35 +19,35 @@ cdef class Air:
         self.a, self.b, self.least_up = a, b, least_up
 
     def __reduce__(self):
-        return Air, (self.a, self.b, self.least_up)
+        return Refraction, (self.a, self.b, self.least_up)
 
-    def bent(self, v):
+    def bend(self, v):
         """Observed directions (..., 3) of unrefracted ones v (..., 3), both in L."""
         cdef const double[:, ::1] given = np.ascontiguousarray(v, float).reshape(-1, 3)
         out = np.empty((given.shape[0], 3))
         cdef double[:, ::1] to = out
         cdef Py_ssize_t k
         for k in range(given.shape[0]):
-            self.bend(&given[k, 0], &to[k, 0])
+            self.raise_one(&given[k, 0], &to[k, 0])
         return out.reshape(np.shape(v))
 
-    def unbent(self, u):
+    def unbend(self, u):
         """Unrefracted directions (..., 3) of observed ones u (..., 3), both in L."""
         cdef const double[:, ::1] given = np.ascontiguousarray(u, float).reshape(-1, 3)
         out = np.empty((given.shape[0], 3))
         cdef double[:, ::1] to = out
         cdef Py_ssize_t k
         for k in range(given.shape[0]):
-            self.unbend(&given[k, 0], &to[k, 0])
+            self.lower_one(&given[k, 0], &to[k, 0])
         return out.reshape(np.shape(u))
 
-    cdef void bend(self, const double *v, double *out) noexcept nogil:
+    cdef void raise_one(self, const double *v, double *out) noexcept nogil:
         """Set `out` (3,) to the observed direction of v (3,) in L: one step of Newton's method, as ERFA's eraAtioq."""
         cdef double flat = max(length(v[0], v[1]), 1e-12), up = max(v[2], self.least_up), tan = flat / up
         cdef double w = self.b * tan * tan
         raised(v, flat, (self.a + w) * tan / (1 + (self.a + 3 * w) / (up * up)), out)
 
-    cdef void unbend(self, const double *u, double *out) noexcept nogil:
+    cdef void lower_one(self, const double *u, double *out) noexcept nogil:
         """Set `out` (3,) to the unrefracted direction of u (3,) in L."""
         cdef double flat = max(length(u[0], u[1]), 1e-12), tan = flat / max(u[2], self.least_up)
         raised(u, flat, -(self.a + self.b * tan * tan) * tan, out)

@@ -11,7 +11,7 @@ import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -22,9 +22,6 @@ from starpos.files import bytes_of, open_regular
 from starpos.frames.pictures import BITS, HEIGHT, SAMPLES, WIDTH, decode_picture
 from starpos.frames.tiff import TIFF_ORDERS, tiff_directory
 from starpos.units import ARCSEC
-
-if TYPE_CHECKING:
-    from scipy.interpolate import RectBivariateSpline
 
 PIXEL_SCALE, TIEPOINT, GEO_KEYS = 33550, 33922, 34735
 GDAL_METADATA, GDAL_NODATA = 42112, 42113
@@ -284,17 +281,7 @@ class Geoid:
         return Deflection(xi, eta, stddev)
 
     def _slopes(self, phi: float, lam: float) -> tuple[float, float]:
-        """Components xi and eta in arcsec; NaN without data."""
-        spline, row, column, north_m, east_m = self._spline(phi, lam)
-        if spline is None:
-            return math.nan, math.nan
-        xi, eta = -spline(row, column, dx=1) / north_m, -spline(row, column, dy=1) / east_m
-        return float(xi.item() / ARCSEC), float(eta.item() / ARCSEC)
-
-    def _spline(
-        self, phi: float, lam: float
-    ) -> "tuple[RectBivariateSpline | None, float, float, float, float]":
-        """Spline of undulations (m) around a place, None without data; its row and column there; m for one of each."""
+        """Components xi and eta in arcsec, by a spline of the undulations around a place; NaN without data."""
         # slow to import, and only needed with a grid
         from scipy.interpolate import RectBivariateSpline
 
@@ -303,8 +290,10 @@ class Geoid:
             nodes, row, column = self._window(phi, lam, reach, reach, stride)
             if np.isfinite(nodes).all():
                 at = np.arange(2 * reach)
-                return RectBivariateSpline(at, at, nodes), row, column, north_m, east_m
-        return None, math.nan, math.nan, north_m, east_m
+                spline = RectBivariateSpline(at, at, nodes)
+                xi, eta = -spline(row, column, dx=1) / north_m, -spline(row, column, dy=1) / east_m
+                return float(xi.item() / ARCSEC), float(eta.item() / ARCSEC)
+        return math.nan, math.nan
 
     def _roughness(self, phi: float, lam: float) -> float:
         """Root mean square change of the slope from node to node around a place, arcsec; NaN without data."""

@@ -169,28 +169,20 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
             f"{utc_text(utc_unix_s)} lies outside the IERS tables (1973 to {last_year:.1f}, and three years "
             "of extrapolation): check the frame's clock, or upgrade astropy-iers-data"
         )
-    leap = tai_minus_utc(utc_unix_s)
-    if beyond > 0:
-        ut1_minus_tai = table.ut1_minus_tai[-1] + beyond * table.slope
-        sigma = np.hypot(table.ut1_sigma[-1], np.interp(beyond, EXTRAPOLATION_DAYS, EXTRAPOLATION_SIGMA_S))
-        return EarthOrientation(
-            ut1_minus_utc_s=float(ut1_minus_tai + leap),
-            ut1_sigma_s=float(sigma),
-            pole_x=table.pole_x[-1],
-            pole_y=table.pole_y[-1],
-            pole_sigma=POLE_SIGMA_RAD,
-            extrapolated_days=float(beyond),
-        )
+    beyond = max(beyond, 0.0)
 
     def at(column: np.ndarray) -> float:
+        """The value at that day; beyond the table's end its last one."""
         return float(np.interp(mjd, table.mjd, column))
 
+    carried_s = float(np.interp(beyond, EXTRAPOLATION_DAYS, EXTRAPOLATION_SIGMA_S)) if beyond else 0.0
     return EarthOrientation(
-        ut1_minus_utc_s=at(table.ut1_minus_tai) + leap,
-        ut1_sigma_s=at(table.ut1_sigma),
+        ut1_minus_utc_s=at(table.ut1_minus_tai) + beyond * table.slope + tai_minus_utc(utc_unix_s),
+        ut1_sigma_s=math.hypot(at(table.ut1_sigma), carried_s),
         pole_x=at(table.pole_x),
         pole_y=at(table.pole_y),
-        pole_sigma=at(table.pole_sigma),
+        pole_sigma=POLE_SIGMA_RAD if beyond else at(table.pole_sigma),
+        extrapolated_days=float(beyond),
     )
 
 

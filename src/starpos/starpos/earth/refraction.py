@@ -11,7 +11,7 @@ from functools import cached_property
 import erfa
 import numpy as np
 
-from starpos.earth._air import Air
+from starpos.earth._air import Refraction
 from starpos.errors import InstrumentError
 
 STANDARD_PRESSURE_PA = 101_325.0
@@ -106,10 +106,10 @@ class Atmosphere:
         )
         return float(np.linalg.norm(parts))
 
-    def refraction(self, factor: float = 1.0) -> "Refraction":
+    def refraction(self, factor: float = 1.0) -> Refraction:
         """The model, with its bending multiplied by `factor` (1, or a step for a derivative)."""
         a, b = self._constants
-        return Refraction(a * factor, b * factor)
+        return Refraction(a * factor, b * factor, MIN_COS_ZENITH)
 
     def raised(self, true: np.ndarray) -> tuple[np.ndarray, float]:
         """An unrefracted direction (3,) in L as it is seen, down to the horizon, and the error of its altitude, rad.
@@ -137,24 +137,3 @@ def _saemundsson(altitude: float) -> float:
     """Refraction of a true altitude, rad, over a constant."""
     degrees = math.degrees(altitude)
     return 1 / math.tan(math.radians(degrees + 10.3 / (degrees + 5.11)))
-
-
-@dataclass(frozen=True)
-class Refraction:
-    """Refraction a tan z + b tan^3 z at the observed zenith distance z (ERFA's eraRefco); a, b in rad."""
-
-    a: float
-    b: float
-
-    @cached_property
-    def compiled(self) -> Air:
-        """The model, for compiled code."""
-        return Air(self.a, self.b, MIN_COS_ZENITH)
-
-    def bend(self, v: np.ndarray) -> np.ndarray:
-        """Raise unrefracted directions v (..., 3) in L to the observed ones (ERFA's eraAtioq, one Newton step)."""
-        return self.compiled.bent(v)
-
-    def unbend(self, u: np.ndarray) -> np.ndarray:
-        """Lower observed directions u (..., 3) in L to the unrefracted ones."""
-        return self.compiled.unbent(u)

@@ -7,7 +7,7 @@ from libc.math cimport fabs, isfinite, sqrt
 import numpy as np
 
 from starpos._numeric.algebra cimport best_rotation, factored, solved, turn_by, turned
-from starpos.earth._air cimport Air
+from starpos.earth._air cimport Refraction
 from starpos.instrument._lens cimport Lens
 
 cdef enum:
@@ -36,12 +36,12 @@ cdef class Adjustment:
     """
 
     cdef readonly object xy, itrs, g
-    cdef Air air
+    cdef Refraction air
     cdef const double[:, ::1] places, stars, to_level
     cdef Lens lens
     cdef double fx, fy, cx, cy, equator, e2
 
-    def __init__(self, xy, itrs, g, Lens lens not None, intrinsics, Air air not None, double equator, double e2):
+    def __init__(self, xy, itrs, g, Lens lens not None, intrinsics, Refraction air not None, double equator, double e2):
         self.xy, self.itrs, self.g = (np.ascontiguousarray(part, float) for part in (xy, itrs, g))
         n = len(self.xy)
         if self.xy.shape != (n, 2) or self.itrs.shape != (n, 3) or self.g.shape != (3, 3):
@@ -69,7 +69,7 @@ cdef class Adjustment:
             self.carry(&s)
         return matrix(s.a4)
 
-    def predict(self, const double[:, ::1] a4, double scale, Air air=None):
+    def predict(self, const double[:, ::1] a4, double scale, Refraction air=None):
         """Pixels (N, 2) where an estimate has the stars, under another air if that is given."""
         out = np.empty((self.stars.shape[0], 2))
         cdef double[:, ::1] to = out
@@ -100,7 +100,7 @@ cdef class Adjustment:
         self.take(a4, scale, &s)
         for k in range(self.stars.shape[0]):
             self.upward(k, &s, v)
-            self.air.bend(v, u)
+            self.air.raise_one(v, u)
             self.air.bend_slopes(v, u, bent)
             self.ray_of(u, c)
             for i in range(3):
@@ -206,13 +206,13 @@ cdef class Adjustment:
         for i in range(3):
             c[i] = self.to_level[0, i] * u[0] + self.to_level[1, i] * u[1] + self.to_level[2, i] * u[2]
 
-    cdef void pixel(self, int k, const Stance *s, Air air, double *out) noexcept nogil:
+    cdef void pixel(self, int k, const Stance *s, Refraction air, double *out) noexcept nogil:
         """Set `out` (2,) to the pixel where star k should be."""
         cdef double[3] v
         cdef double[3] u
         cdef double[3] c
         self.upward(k, s, v)
-        air.bend(v, u)
+        air.raise_one(v, u)
         self.ray_of(u, c)
         self.lens.seen(c, out)
         out[0] = self.cx + s.scale * self.fx * out[0]

@@ -24,7 +24,6 @@ from starpos.identification.blind import (
 )
 from starpos.identification.quads import cached_quads
 from starpos.identification.search import field_of
-from starpos.identification.triangles import no_triangles
 from starpos.instrument.camera import Camera
 from starpos.progress import CpuLimit, Progress, quiet
 from starpos.sky.catalogue import Catalogue
@@ -67,7 +66,7 @@ class BlindSolver:
         if noise := why_noise(stars):
             return Solution.failed(stars, Status.NOT_IDENTIFIED, noise)
         try:
-            sky = Sky.at(self.catalogue, no_triangles(), stars.mid_unix_s)
+            sky = Sky.at(self.catalogue, None, stars.mid_unix_s)
         except StarposError as e:
             return Solution.refused(stars, e)
         # building them takes no time of the search

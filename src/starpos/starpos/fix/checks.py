@@ -95,7 +95,7 @@ def check_risen(stars: Stars, found: Identification, camera: Camera, sky: Sky, u
         rows = np.flatnonzero(stars.on_frame & np.isfinite(every[:, 0]))
         field = fisheye.WideField(every[rows], mean_sigma(stars.covariance[rows]), camera)
         part = fisheye.part_of(field, sky, found.but(star=np.searchsorted(rows, star)))
-        whole = fisheye.outwards(field, sky, *part)
+        whole = fisheye.outwards(sky, *part)
         if whole is not None and whole[2]:
             lens, better, _ = whole
             every, star = lens.directions(stars.x, stars.y), rows[better.star]

@@ -104,7 +104,7 @@ def attitude_at_place(stars: MatchedStars, place: Place, about: Circumstances) -
         leaned = [rotation.from_vector(turn) for turn in np.eye(3)[:2] * STEP_RAD]
         leaning = [
             adjustment_of(stars.xy, camera, r @ g, itrs, refraction).predict(
-                r @ seen.fit.a4, seen.fit.scale, refraction.compiled
+                r @ seen.fit.a4, seen.fit.scale, refraction
             )
             for r in leaned
         ]

@@ -42,9 +42,11 @@ from starpos.frames.frame import EDGE_PX, Stars
 from starpos.frames.tables import Pointing
 from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, field_of, fisheye, identify
 from starpos.identification._frame import FrameStars, all_within, ideal_frame, mean_sigma, unit_vectors
+from starpos.identification.evidence import finder_of
 from starpos.identification.pose import MIN_SIGMA_PX, TEST_STARS
 from starpos.identification.prior import AimPrior, Hint
 from starpos.identification.search import Look, Priors, identify_near, second_look, through
+from starpos.identification.sky import touch
 from starpos.identification.triangles import TriangleCatalogue, cached_triangles
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.inclinometer import EITHER_WAY, Tilt
@@ -142,7 +144,9 @@ class Solver:
         Returns what such a field lacks in the catalogue, as `too_thin` says it, '' if nothing.
         """
         camera, catalogue, triangles = self.view(width, height, origin_px)
-        Sky(catalogue, triangles).load()
+        # what the first identification would have to wait for
+        finder_of(catalogue, triangles)
+        touch(triangles)
         return deeper.too_thin(catalogue, camera)
 
     def identify(

@@ -12,7 +12,7 @@ import numpy as np
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import ECCENTRICITY2
 from starpos.earth.orientation import EQUATOR_M_PER_S, ROTATION_RAD_S, SPEED_OF_LIGHT, later
-from starpos.earth.refraction import Atmosphere, Refraction
+from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere, Refraction
 from starpos.errors import FixError
 from starpos.fix._adjustment import Adjustment, gain_of, spread
 from starpos.fix._scatter import distances2, expected_variance, sifted
@@ -33,7 +33,7 @@ SETTLED, MAX_STEPS = 1e-11, 20
 # the rounds end when the scatter changes by less than this share of itself, and of this minimum, px2
 SAME_SHARE, SAME_PX2 = 0.02, 1e-6
 # an air that bends nothing
-BENT_ALREADY = Refraction(0.0, 0.0).compiled
+BENT_ALREADY = Refraction(0.0, 0.0, MIN_COS_ZENITH)
 # a covariance that is the same in all directions
 ISOTROPIC = np.eye(2)
 
@@ -70,7 +70,7 @@ def adjustment_of(
     """
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     ground = EQUATOR_M_PER_S / SPEED_OF_LIGHT, ECCENTRICITY2
-    return Adjustment(xy, itrs, g, camera.lens, intrinsics, refraction.compiled, *ground)
+    return Adjustment(xy, itrs, g, camera.lens, intrinsics, refraction, *ground)
 
 
 def fitted(problem: Adjustment, local: np.ndarray, stated: np.ndarray) -> Fitted:
@@ -293,7 +293,7 @@ class StarFit:
 
     def _bent(self, atmosphere: Atmosphere) -> np.ndarray:
         """Move (M, 2) of the stars, px, by STEP_REFRACTION of their refraction more."""
-        fit, stronger = self.fit, atmosphere.refraction(1 + STEP_REFRACTION).compiled
+        fit, stronger = self.fit, atmosphere.refraction(1 + STEP_REFRACTION)
         moved = self.problem.predict(fit.a4, fit.scale, stronger) - self.problem.xy - fit.residual
         return moved[fit.kept]
 

@@ -2,13 +2,11 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Build a catalogue of triangles: those of the brightest stars of circles over the sky, measured and put in bins."""
 
-from libc.limits cimport INT_MAX
 from libc.math cimport M_PI, asin, atan2, cos, fabs, floor, sin, sqrt
 
 import numpy as np
 
 from starpos._numeric.algebra cimport fetch
-from starpos._numeric.limits cimport within
 from starpos.identification._triangles cimport CODES, bin_of, code_of, is_counter_clockwise
 
 
@@ -137,8 +135,6 @@ def distinct(const int[::1] brightest, const long long[::1] others, Py_ssize_t n
     """
     cdef Py_ssize_t k, begin = 0, end, kept = 0, count = brightest.shape[0]
     cdef int a
-    if others.shape[0] != count or not within[int](&brightest[0], count, 0, <int>min(n, INT_MAX) - 1):
-        raise ValueError(f"a triple is not of the {n} stars")
     starts, ordered = np.zeros(n + 1, np.intp), np.empty(count, np.int64)
     cdef Py_ssize_t[::1] start = starts
     cdef long long[::1] pair = ordered
@@ -203,27 +199,16 @@ def binned(
     cdef int[3] code
     cdef double least = sin(shortest / 2), most = sin(longest / 2)
     per_unit[0], per_unit[1], per_unit[2] = CODES / (2 * M_PI / 3), CODES / (M_PI / 3), CODES / longest
-    if len(first) != n + 1 or first[0] != 0 or first[n] != count or np.diff(first).min(initial=0) < 0:
-        raise ValueError("the triples of each star do not follow each other")
-    if not within[int](&rows[0], n, 0, <int>min(len(v), INT_MAX) - 1):
-        raise ValueError(f"a triple is of a star beyond {len(v)}")
-    if count > INT_MAX:
-        raise ValueError(f"{count} triangles: a catalogue holds at most {INT_MAX}")
     of = np.empty(count, np.int32)
     made = np.empty((count, 3), np.uint16), np.empty((count, 3), np.int32), np.empty(count, np.uint8)
-    starts = np.zeros(bins + 1, np.int32)
     cdef int[::1] bin = of
     cdef unsigned short[:, ::1] shape = made[0]
     cdef int[:, ::1] corners = made[1]
     cdef unsigned char[::1] turns = made[2]
-    cdef int[::1] start = starts
     with nogil:
         for a in range(n):
             for k in range(first[a], first[a + 1]):
                 b, c = others[k] >> 32, <unsigned int>others[k]
-                if not a < b < c < n:
-                    with gil:
-                        raise ValueError(f"stars {a}, {b} and {c} of {n} make no triple")
                 corner[0], corner[1], corner[2] = rows[a], rows[b], rows[c]
                 for i in range(3):
                     sine[i] = _half_chord(&v[corner[(i + 1) % 3], 0], &v[corner[(i + 2) % 3], 0])
@@ -244,31 +229,10 @@ def binned(
                 turns[kept] = is_counter_clockwise(&v[corner[0], 0], &v[corner[1], 0], &v[corner[2], 0])
                 bin[kept] = bin_of(code[0], code[1], code[2])
                 kept += 1
-        for k in range(kept):
-            fetch(&start[bin[min(k + 2 * AHEAD, kept - 1)] + 1])
-            start[bin[k] + 1] += 1
-    np.cumsum(starts, out=starts)
-    ordered = np.empty((kept, 3), np.uint16), np.empty((kept, 3), np.int32), np.empty(kept, np.uint8)
-    next_ = starts[:bins].copy()
-    cdef int[::1] next = next_
-    cdef unsigned short[:, ::1] shape_out = ordered[0]
-    cdef int[:, ::1] corners_out = ordered[1]
-    cdef unsigned char[::1] turns_out = ordered[2]
-    cdef Py_ssize_t to
-    with nogil:
-        for k in range(kept):
-            # the places are far from each other
-            fetch(&next[bin[min(k + 2 * AHEAD, kept - 1)]])
-            to = next[bin[min(k + AHEAD, kept - 1)]]
-            fetch(&shape_out[min(to, kept - 1), 0])
-            fetch(&corners_out[min(to, kept - 1), 0])
-            fetch(&turns_out[min(to, kept - 1)])
-            to = next[bin[k]]
-            next[bin[k]] += 1
-            for i in range(3):
-                corners_out[to, i], shape_out[to, i] = corners[k, i], shape[k, i]
-            turns_out[to] = turns[k]
-    return ordered[1], ordered[2].view(bool), ordered[0], starts
+    of = of[:kept]
+    order = np.argsort(of, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=bins))]).astype(np.int32)
+    return made[1][order], made[2][order].view(bool), made[0][order], starts
 
 
 cdef inline double _half_chord(const double *a, const double *b) noexcept nogil:

@@ -2,7 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The stars of a frame in pixels from the principal point, as the other modules here take them."""
 
-from libc.math cimport atan, hypot, isfinite, rint, sqrt
+from libc.math cimport atan, ceil, hypot, isfinite, rint, sqrt
 
 import numpy as np
 
@@ -20,12 +20,6 @@ cdef class FrameStars:
     area_px2  area over which false detections are spread; never more than the true one
     tested    so many of the brightest decide whether a pose is right
     """
-
-    def __init__(self, *, xy, sigma, middle, half, double focal_px, double area_px2, int tested):
-        _centre(self, middle[0], middle[1], middle[1])
-        self.reach[0], self.reach[1] = half
-        self.focal_px, self.area_px2, self.tested = focal_px, area_px2, tested
-        _hold(self, xy, sigma)
 
     def __len__(self):
         return self.count
@@ -82,17 +76,15 @@ cdef void _centre(FrameStars f, double x, double y, double flipped) noexcept:
 cdef FrameStars _hold(FrameStars f, xy, sigma):
     """Give f these stars' pixels and errors; its size and focal length are there."""
     cdef Py_ssize_t n = len(sigma)
-    if np.shape(xy) != (2, n, 2) or np.shape(sigma) != (n,):
-        raise ValueError(f"{n} errors for pixels of shape {np.shape(xy)}: (2, {n}, 2) is expected")
     _take(f, n, np.concatenate([np.ravel(xy), sigma], dtype=float))
     return _measured(f)
 
 
-cdef double *_take(FrameStars f, Py_ssize_t n, numbers) except NULL:
-    """Let f keep its n stars in `numbers` (5 n,); the first of these."""
+cdef int _take(FrameStars f, Py_ssize_t n, numbers) except -1:
+    """Let f keep its n stars in `numbers` (5 n,)."""
     cdef double *first = <double *>numbers_of(numbers, 5 * n * sizeof(double))
     f.count, f.numbers, f.pixel, f.error = n, numbers, first, first + 4 * n
-    return first
+    return 0
 
 
 cdef FrameStars _measured(FrameStars f):
@@ -111,66 +103,87 @@ cdef FrameStars _shape_of(FrameStars f):
     return out
 
 
+cdef struct Square:
+    # A camera as if its pixels were square: px of its focal length, principal point and frame; px a row of its own.
+    double focal, cx, cy, width, rows, squeeze
+
+
+cdef Square _square(camera) except *:
+    cdef Square s
+    s.focal, s.cx, s.width = camera.fx, camera.cx, camera.width
+    s.squeeze = s.focal / <double>camera.fy
+    s.cy, s.rows = camera.cy * s.squeeze, max(1.0, rint(camera.height * s.squeeze))
+    return s
+
+
+cdef FrameStars _framed(const Square *s, numbers, Py_ssize_t n, double margin, int tested):
+    """The n stars in `numbers` on a frame that reaches so far beyond its size."""
+    cdef FrameStars out = FrameStars.__new__(FrameStars)
+    _take(out, n, numbers)
+    _centre(out, (s.width - 1) / 2 - s.cx, (s.rows - 1) / 2 - s.cy, (s.rows - 1) / 2 - s.cy)
+    out.reach[0], out.reach[1] = s.width / 2 + margin, s.rows / 2 + margin
+    out.focal_px, out.area_px2, out.tested = s.focal, s.width * s.rows, tested
+    return _measured(out)
+
+
 def ideal_frame(across_px, down_px, covariance, camera, double edge_px, double least_sigma, int tested):
     """FrameStars of pixels (N,), (N,), with covariances (N, 2, 2), of a pinhole camera without distortion.
 
     edge_px      so far beyond the frame they may be: None if one is farther
     least_sigma  px; smaller errors become it
     """
-    cdef double fx = camera.fx, squeeze = fx / <double>camera.fy, cx = camera.cx, cy = camera.cy
-    cdef double width = camera.width, height = camera.height, across, down
+    cdef Square s = _square(camera)
+    cdef double height = camera.height, across, down
     cdef Py_ssize_t n = len(across_px), k
     cdef const double *x = <const double *>numbers_of(across_px, n * sizeof(double))
     cdef const double *y = <const double *>numbers_of(down_px, n * sizeof(double))
     cdef const double *variance = <const double *>numbers_of(covariance, 4 * n * sizeof(double))
-    cdef FrameStars out = FrameStars.__new__(FrameStars)
-    cdef double *xy = _take(out, n, np.empty(5 * n))
-    # as a camera with square pixels sees them
-    cdef double rows = max(1.0, rint(height * squeeze))
+    numbers = np.empty(5 * n)
+    cdef double *xy = <double *>numbers_of(numbers, 5 * n * sizeof(double))
     for k in range(n):
-        if not (-edge_px < x[k] < width - 1 + edge_px and -edge_px < y[k] < height - 1 + edge_px):
+        if not (-edge_px < x[k] < s.width - 1 + edge_px and -edge_px < y[k] < height - 1 + edge_px):
             return None
-        across, down = x[k] - cx, (y[k] - cy) * squeeze
+        across, down = x[k] - s.cx, y[k] * s.squeeze - s.cy
         xy[2 * k] = xy[2 * (n + k)] = across
-        xy[2 * k + 1], xy[2 * (n + k) + 1] = down, rows - 1 - 2 * cy * squeeze - down
+        xy[2 * k + 1], xy[2 * (n + k) + 1] = down, s.rows - 1 - 2 * s.cy - down
         xy[4 * n + k] = max(sqrt((variance[4 * k] + variance[4 * k + 3]) / 2), least_sigma)
-    _centre(out, (width - 1) / 2 - cx, (rows - 1) / 2 - cy * squeeze, (rows - 1) / 2 - cy * squeeze)
-    out.reach[0], out.reach[1] = width / 2, rows / 2
-    out.focal_px, out.area_px2, out.tested = fx, width * rows, tested
-    return _measured(out)
+    return _framed(&s, numbers, n, 0.0, tested)
 
 
-def projected(
-    const double[:, ::1] v, const double[::1] sigma, double focal_px, double centre_x, double centre_y, int width,
-    int height, double least_sigma,
+def framed(
+    const double[:, ::1] seen, const double[::1] sigma, camera, double least_sigma, int tested, double edge_px, double widest
 ):
-    """Project unit vectors v (N, 3) in C with an ideal camera.
+    """FrameStars of pixels `seen` (N, 2), or of unit vectors (N, 3) in C, with errors (N,) px, as a camera without distortion.
 
-    sigma                       (N,) px
-    centre_x, centre_y          px of the principal point
-    width, height               px of the frame
-    least_sigma                 px; smaller errors become it
+    least_sigma      px; smaller errors become it
+    edge_px, widest  for stars that lie farther than edge_px beyond the frame it gets a margin, at most this share of a side
 
-    Returns pixels (2, N, 2) from the principal point, as they are and with the frame's rows flipped; the errors (N,); and
-    how far (px) the farthest star lies beyond the frame. ValueError if one is behind the camera or not a finite number.
+    ValueError if one is behind the camera or not a finite number.
     """
-    cdef Py_ssize_t n = v.shape[0], k
+    cdef Square s = _square(camera)
+    cdef Py_ssize_t n = seen.shape[0], k
     cdef double x, y, beyond = 0.0
-    cdef bint sound = sigma.shape[0] == n
-    pixels, errors = np.empty((2, n, 2)), np.empty(n)
-    cdef double[:, :, ::1] xy = pixels
-    cdef double[::1] error = errors
+    cdef bint sound = sigma.shape[0] == n, rays = seen.shape[1] == 3
+    numbers = np.empty(5 * n)
+    cdef double[::1] xy = numbers
     for k in range(n if sound else 0):
-        x, y = v[k, 0] / v[k, 2] * focal_px, v[k, 1] / v[k, 2] * focal_px
-        sound = sound and v[k, 2] > 0 and isfinite(x) and isfinite(y) and isfinite(sigma[k])
-        xy[0, k, 0] = xy[1, k, 0] = x
-        xy[0, k, 1], xy[1, k, 1] = y, height - 1 - 2 * centre_y - y
-        error[k] = max(sigma[k], least_sigma)
-        beyond = max(beyond, max(-x - centre_x, x + centre_x - (width - 1)))
-        beyond = max(beyond, max(-y - centre_y, y + centre_y - (height - 1)))
+        if rays:
+            x, y = seen[k, 0] / seen[k, 2] * s.focal, seen[k, 1] / seen[k, 2] * s.focal
+            sound = sound and seen[k, 2] > 0
+        else:
+            x, y = seen[k, 0] - s.cx, seen[k, 1] * s.squeeze - s.cy
+        sound = sound and isfinite(x) and isfinite(y) and isfinite(sigma[k])
+        xy[2 * k] = xy[2 * (n + k)] = x
+        xy[2 * k + 1], xy[2 * (n + k) + 1] = y, s.rows - 1 - 2 * s.cy - y
+        xy[4 * n + k] = max(sigma[k], least_sigma)
+        beyond = max(beyond, max(-x - s.cx, x + s.cx - (s.width - 1)))
+        beyond = max(beyond, max(-y - s.cy, y + s.cy - (s.rows - 1)))
     if not sound:
         raise ValueError("stars to be identified need finite pixels and errors: leave the others out")
-    return pixels, errors, beyond
+    # without distortion, stars that a lens has drawn in may lie beyond the frame
+    return _framed(
+        &s, numbers, n, ceil(min(beyond - edge_px, widest * max(s.width, s.rows))) if beyond > edge_px else 0.0, tested
+    )
 
 
 def all_within(const double[::1] x, const double[::1] y, double width, double height, double edge_px):

@@ -99,51 +99,8 @@ cdef void _fit_alone(
     _fit(xy, w, sigma, star, near, n, steps, small_step, attitude, focal)
 
 
-cdef class Chances:
-    """What `weighed` reckons with.
-
-    errors_px, log_shares  (4,): errors beside the centroids' own, and the logarithms of their probabilities
-    double_px              a closer detection says nothing new
-    """
-
-    def __init__(self, errors_px, log_shares, double double_px):
-        cdef int k
-        self.double_px = double_px
-        for k in range(ERRORS):
-            self.errors_px[k], self.log_shares[k] = errors_px[k], log_shares[k]
-
-
-cdef class Rules:
-    """Rules by which stars are matched.
-
-    rounds, fewest_stars            so often stars are matched and a pose fitted; with fewer pairs there is none
-    steps, small_step               most steps of a fit; a step below this (rad) is the last one
-    floor_px                        error beside each star's own
-    sigma_per_mad, least_spread_px  the spread of residuals over their median, and its least value
-    gate_sigma, gate_px             a star may be so many times the spread from its place, and so far beyond
-    edge_px, inside_px              a star so far beyond the frame is on it, and one so near its edge may be cut off
-    blend_px                        closer stars make one image
-    per_detection, more_stars       so many catalogue stars are taken for each detection, and so many more
-    most_stars                      so many of the brightest detections take part
-    bent_px                         where the residuals spread more, the lens bends, and all stars count alike
-    """
-
-
-    def __init__(
-        self, *, int rounds, int fewest_stars, int steps, double small_step, double floor_px, double sigma_per_mad,
-        double least_spread_px, double gate_sigma, double gate_px, double edge_px, double inside_px, double blend_px,
-        int per_detection, int more_stars, int most_stars, double bent_px,
-    ):
-        self.rounds, self.fewest, self.steps, self.small_step = rounds, fewest_stars, steps, small_step
-        self.floor_px, self.per_mad, self.least = floor_px, sigma_per_mad, least_spread_px
-        self.gate_sigma, self.gate_px = gate_sigma, gate_px
-        self.edge_px, self.inside_px, self.blend_px = edge_px, inside_px, blend_px
-        self.per_detection, self.more_stars, self.most_stars = per_detection, more_stars, most_stars
-        self.bent_px = bent_px
-
-
 cdef void settle(
-    FrameStars frame, bint mirrored, int n, const Visible *stars, Rules rules, double *radius, Matching *m, double *pixel,
+    FrameStars frame, bint mirrored, int n, const Visible *stars, const Rules *rules, double *radius, Matching *m, double *pixel,
     double *work, Settled *out,
 ) noexcept nogil:
     """Match a frame's n brightest stars with the catalogue's, fit the pose, and match again until no pair changes.
@@ -172,15 +129,15 @@ cdef void settle(
         if same and k == out.count:
             break
         out.count = k
-        if out.count < rules.fewest:
+        if out.count < rules.fewest_stars:
             break
         _refit(frame, xy, stars, rules, sigma, sigma, pixel, work, out)
-        out.spread = rules.per_mad * median(work, 2 * out.count)
+        out.spread = rules.sigma_per_mad * median(work, 2 * out.count)
         gates(frame, rules, out.spread, n, radius)
 
 
 cdef void _refit(
-    FrameStars frame, const double *xy, const Visible *stars, Rules rules, const double *sigma, const double *floored,
+    FrameStars frame, const double *xy, const Visible *stars, const Rules *rules, const double *sigma, const double *floored,
     double *pixel, double *off, Settled *out,
 ) noexcept nogil:
     """Fit the pose to the pairs with errors sigma (M,); set pixels, offsets (M, 2) and residuals, with errors floored (M,)."""
@@ -202,15 +159,15 @@ cdef void _refit(
     out.rms, out.mean_square = sqrt(weighted / weights), whole / (2 * out.count)
 
 
-cdef void gates(FrameStars frame, Rules rules, double spread, int n, double *radius) noexcept nogil:
+cdef void gates(FrameStars frame, const Rules *rules, double spread, int n, double *radius) noexcept nogil:
     """Set how far (n,) px the n brightest stars may be from their places, where the residuals have a spread."""
     cdef int i
     for i in range(n):
-        radius[i] = rules.gate_sigma * length(max(spread, rules.least), frame.error[i]) + rules.gate_px
+        radius[i] = rules.gate_sigma * length(max(spread, rules.least_spread_px), frame.error[i]) + rules.gate_px
 
 
 cdef void count_alike(
-    FrameStars frame, bint mirrored, const Visible *stars, Rules rules, double *pixel, double *work, Settled *out
+    FrameStars frame, bint mirrored, const Visible *stars, const Rules *rules, double *pixel, double *work, Settled *out
 ) noexcept nogil:
     """Fit the pose of pairs again, to all alike; the arguments are those of `settle`, and work for 4 numbers a pair."""
     cdef double *sigma = work + 2 * out.count
@@ -239,16 +196,16 @@ def log_ratio(
     cdef Py_ssize_t[::1] row = rows
     cdef int n = xy.shape[0], many = star.shape[0]
     if many == 0:
-        return weighed(&xy[0, 0], &sigma_px[0], n, area_px2, &attitude[0, 0], focal_px, &width[0], NULL, NULL, NULL, NULL, 0, chances)
+        return weighed(&xy[0, 0], &sigma_px[0], n, area_px2, &attitude[0, 0], focal_px, &width[0], NULL, NULL, NULL, NULL, 0, &chances)
     return weighed(
-        &xy[0, 0], &sigma_px[0], n, area_px2, &attitude[0, 0], focal_px, &width[0], &star[0], &rank[0], &w[0, 0], &row[0], many, chances
+        &xy[0, 0], &sigma_px[0], n, area_px2, &attitude[0, 0], focal_px, &width[0], &star[0], &rank[0], &w[0, 0], &row[0], many, &chances
     )
 
 
 cdef double weighed(
     const double *xy, const double *sigma_px, int n, double area_px2, const double *attitude, double focal_px,
     const double *width, const Py_ssize_t *star, const Py_ssize_t *rank, const double *w, const Py_ssize_t *row, int many,
-    Chances chances,
+    const Chances *chances,
 ) except? -1:
     """What `log_ratio` returns, of the n brightest detections; w[row[k]] is the direction of the star matched with star[k]."""
     cdef int e, i, j, k, passed, hits = 0

@@ -2,9 +2,6 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Quads of the sky that look like quads of a frame, looked up in the bins of their shapes and sizes."""
 
-from libc.stdlib cimport free, realloc
-from libc.string cimport memcpy
-
 import numpy as np
 
 cdef enum:
@@ -13,27 +10,9 @@ cdef enum:
     BINNED = 4
 
 
-cdef struct Found:
-    # Pairs of query and quad: how many there are, and for how many there is room.
-    int *pair
-    Py_ssize_t count, room
-
-
 cdef inline int _bin(double share, int bins) noexcept nogil:
     """The bin of a value from 0 to 1; of one beyond, the first or last."""
     return <int>(max(0.0, min(share * bins, bins - 1.0)))
-
-
-cdef inline bint _room_for_one(Found *found) noexcept nogil:
-    """Make room for another pair; whether there is."""
-    cdef void *larger
-    if found.count < found.room:
-        return True
-    larger = realloc(found.pair, 4 * (found.room + 1024) * sizeof(int))
-    if larger == NULL:
-        return False
-    found.pair, found.room = <int *>larger, 2 * (found.room + 1024)
-    return True
 
 
 def near(
@@ -48,67 +27,39 @@ def near(
     wanted, tolerance           (N, 5) shapes, as shares of the longest side, and how far off (N,) each side may be
     wanted_size, size_tolerance (N,) logarithms of the longest sides, and how far off they may be
     """
-    cdef Found found
-    cdef bint whole = True
-    cdef Py_ssize_t n = len(wanted)
+    cdef Py_ssize_t n = len(wanted), q, run, count = 0
+    cdef int[BINNED] low, high
+    cdef double[ALL_SIDES] least, greatest
+    cdef int a, b, c, d, i, k, first, last
+    cdef double per_bin = 1 / (largest - smallest)
     if not (wanted.shape[1] == shape.shape[1] == ALL_SIDES and len(tolerance) == len(wanted_size) == n):
         raise ValueError("shapes, tolerances and sizes of different lengths")
     if len(bin_start) != bins**BINNED * size_bins + 1 or not len(shape) == len(log_size) == bin_start[len(bin_start) - 1]:
         raise ValueError("the bins do not fit the quads")
-    found.pair, found.count, found.room = NULL, 0, 0
-    try:
-        with nogil:
-            whole = _near(&bin_start[0], shape, log_size, wanted, tolerance, wanted_size, size_tolerance, codes, bins,
-                          size_bins, smallest, largest, most, &found)
-        if not whole:
-            raise MemoryError
-        pairs = np.empty((found.count, 2), np.intc)
-        _copy(pairs, &found)
-        return np.ascontiguousarray(pairs.T, np.intp)
-    finally:
-        free(found.pair)
-
-
-cdef void _copy(int[:, ::1] pairs, const Found *found) noexcept:
-    if found.count:
-        memcpy(&pairs[0, 0], found.pair, 2 * found.count * sizeof(int))
-
-
-cdef bint _near(
-    const int *bin_start, const unsigned short[:, ::1] shape, const float[::1] log_size, const double[:, ::1] wanted,
-    const double[::1] tolerance, const double[::1] wanted_size, double size_tolerance, int codes, int bins,
-    int size_bins, double smallest, double largest, Py_ssize_t most, Found *found,
-) noexcept nogil:
-    """Fill in `found`; False where memory ends."""
-    cdef Py_ssize_t q
-    cdef int[BINNED] low, high
-    cdef double[ALL_SIDES] least, greatest
-    cdef int a, b, c, d, i, k, first, last
-    cdef Py_ssize_t run
-    cdef double per_bin = size_bins / (largest - smallest)
-    for q in range(len(wanted)):
-        for i in range(ALL_SIDES):
-            least[i], greatest[i] = (wanted[q, i] - tolerance[q]) * codes, (wanted[q, i] + tolerance[q]) * codes
-        for i in range(BINNED):
-            low[i], high[i] = _bin(least[i] / codes, bins), _bin(greatest[i] / codes, bins)
-        first = _bin((wanted_size[q] - size_tolerance - smallest) * per_bin / size_bins, size_bins)
-        last = _bin((wanted_size[q] + size_tolerance - smallest) * per_bin / size_bins, size_bins)
-        for a in range(low[0], high[0] + 1):
-            for b in range(low[1], high[1] + 1):
-                for c in range(low[2], high[2] + 1):
-                    for d in range(low[3], high[3] + 1):
-                        run = <Py_ssize_t>(((a * bins + b) * bins + c) * bins + d) * size_bins
-                        for k in range(bin_start[run + first], bin_start[run + last + 1]):
-                            if _alike(&shape[k, 0], least, greatest) and (
-                                -size_tolerance <= log_size[k] - wanted_size[q] <= size_tolerance
-                            ):
-                                if found.count == most:
-                                    return True
-                                if not _room_for_one(found):
-                                    return False
-                                found.pair[2 * found.count], found.pair[2 * found.count + 1] = <int>q, k
-                                found.count += 1
-    return True
+    found = np.empty((2, most), np.intp)
+    cdef Py_ssize_t[:, ::1] pair = found
+    with nogil:
+        for q in range(n):
+            for i in range(ALL_SIDES):
+                least[i], greatest[i] = (wanted[q, i] - tolerance[q]) * codes, (wanted[q, i] + tolerance[q]) * codes
+            for i in range(BINNED):
+                low[i], high[i] = _bin(least[i] / codes, bins), _bin(greatest[i] / codes, bins)
+            first = _bin((wanted_size[q] - size_tolerance - smallest) * per_bin, size_bins)
+            last = _bin((wanted_size[q] + size_tolerance - smallest) * per_bin, size_bins)
+            for a in range(low[0], high[0] + 1):
+                for b in range(low[1], high[1] + 1):
+                    for c in range(low[2], high[2] + 1):
+                        for d in range(low[3], high[3] + 1):
+                            run = <Py_ssize_t>(((a * bins + b) * bins + c) * bins + d) * size_bins
+                            for k in range(bin_start[run + first], bin_start[run + last + 1]):
+                                if count < most and _alike(&shape[k, 0], least, greatest) and (
+                                    -size_tolerance <= log_size[k] - wanted_size[q] <= size_tolerance
+                                ):
+                                    pair[0, count], pair[1, count] = q, k
+                                    count += 1
+            if count == most:
+                break
+    return found[:, :count]
 
 
 cdef inline bint _alike(const unsigned short *shape, const double *least, const double *greatest) noexcept nogil:

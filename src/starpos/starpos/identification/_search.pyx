@@ -63,44 +63,75 @@ cdef class Anywhere:
         return self.log_share + log((self.mirrored if mirrored else 1 - self.mirrored) * density / (8 * M_PI * M_PI))
 
 
-cdef class Judge:
-    """Judges poses of a frame by the evidence of its stars.
+cdef struct Limits:
+    # The first looks are at triangles of so many of the brightest stars.
+    int[LOOKS] first_stars
+    # Stars lie within so many sigma of their places; logarithm of the share of detections that may be false. Log-odds of a pose
+    # that is judged, by so many of the brightest catalogue stars on the frame. With larger errors of the centroids a candidate
+    # counts only if another one supports it.
+    double match_sigma, log_false, worth_a_fit, loose_px
+    int most_stars
+    # A look-up is limited to triangles for which so many candidates are expected by chance; so many, the best, are looked at.
+    double most_candidates
+    int most_looked_at
+    # In a crowd of false stars so many triangles are looked up, or more where it has many; and what the two above are there.
+    int most_looked_up
+    double most_in_crowd
+    int most_supported
 
-    years, velocity  of the date: Julian years after J2000, and (3,) in units of c
-    prior            as `evidence.Prior` has it
-    enough           log-odds of an identification
+
+cdef class Finder:
+    """Tables and rules by which poses of frames are judged, and found where they are lost in space.
+
+    rules, chances, limits  mappings of what the structures of that name hold
     """
 
-    cdef FrameStars frame
-    cdef StarTable table
-    cdef Date date
+    cdef StarTable stars
+    cdef TriangleTable triangles
+    cdef BrightTable bright
     cdef Rules rules
     cdef Chances chances
+    cdef Limits limits
+
+    def __init__(self, StarTable stars, TriangleTable triangles, BrightTable bright, rules, chances, limits):
+        self.stars, self.triangles, self.bright = stars, triangles, bright
+        self.rules, self.chances, self.limits = rules, chances, limits
+
+    def judge(self, FrameStars frame, double years, velocity, prior, double enough):
+        """A Judge of poses of a frame.
+
+        years, velocity  of the date: Julian years after J2000, and (3,) in units of c
+        prior            as `evidence.Prior` has it
+        enough           log-odds of an identification
+        """
+        cdef Judge out = Judge.__new__(Judge)
+        out.finder, out.frame, out.date, out.enough = self, frame, date_of(years, velocity), enough
+        log_density = prior.log_density
+        if isinstance(log_density, Anywhere):
+            out.anywhere = log_density
+        else:
+            out.log_density = prior.log_density_at
+        memcpy(out.width, numbers_of(prior.width, 4 * sizeof(double)), 4 * sizeof(double))
+        return out
+
+    def lost(self, FrameStars frame, double years, velocity, prior, double enough, stages, bint crowded):
+        """An iterator over what is identified, as a `judge` with the same arguments has it; stages, crowded: see `Lost`."""
+        cdef Lost out = Lost.__new__(Lost)
+        out._take(self.judge(frame, years, velocity, prior, enough), stages, crowded)
+        return out
+
+
+cdef class Judge:
+    """Judges poses of a frame by the evidence of its stars."""
+
+    cdef Finder finder
+    cdef FrameStars frame
+    cdef Date date
     cdef double[4] width
     # one of them is None
     cdef Anywhere anywhere
     cdef object log_density
     cdef double enough
-
-    def __init__(
-        self, FrameStars frame, StarTable table, double years, velocity, prior, double enough, Rules rules, Chances chances
-    ):
-        self._take(frame, table, years, velocity, prior, enough, rules, chances)
-
-    cdef int _take(
-        self, FrameStars frame, StarTable table, double years, velocity, prior, double enough, Rules rules, Chances chances
-    ) except -1:
-        """Take the arguments of a new one."""
-        self.frame, self.table, self.date, self.rules = frame, table, date_of(years, velocity), rules
-        self.chances = chances
-        self.enough = enough
-        log_density = prior.log_density
-        if isinstance(log_density, Anywhere):
-            self.anywhere = log_density
-        else:
-            self.log_density = prior.log_density_at
-        memcpy(self.width, numbers_of(prior.width, 4 * sizeof(double)), 4 * sizeof(double))
-        return 0
 
     def identified(self, const double[:, ::1] attitude, double focal_px, bint mirrored, const double[::1] radius_px):
         """What is identified by a pose near the right one.
@@ -121,7 +152,7 @@ cdef class Judge:
     cdef judged(self, const double *attitude, double focal, bint mirrored, const double *radius):
         """What `identified` returns."""
         cdef Work work
-        cdef int n = self._deciding(), most = min(self.frame.count, self.rules.most_stars)
+        cdef int n = self._deciding(), most = min(self.frame.count, self.finder.rules.most_stars)
         cdef double log_odds
         memcpy(work.end.attitude, attitude, 9 * sizeof(double))
         work.end.focal, work.stars.memory, work.m.memory, work.memory = focal, NULL, NULL, NULL
@@ -130,7 +161,8 @@ cdef class Judge:
                 return None
             log_odds = weighed(
                 pixels_of(self.frame, mirrored), self.frame.error, n, self.frame.area_px2, work.end.attitude, work.end.focal,
-                self.width, work.end.star, work.end.near, work.stars.w, work.end.near, work.end.count, self.chances,
+                self.width, work.end.star, work.end.near, work.stars.w, work.end.near, work.end.count,
+                &self.finder.chances,
             )
             if self.anywhere is not None:
                 log_odds += self.anywhere.at(work.end.focal, mirrored)
@@ -141,9 +173,10 @@ cdef class Judge:
                 return None
             if self.frame.count > n and not self._settled(mirrored, most, NULL, &work):
                 return None
-            if work.end.spread > self.rules.bent_px:
+            if work.end.spread > self.finder.rules.bent_px:
                 count_alike(
-                    self.frame, mirrored, &work.stars, self.rules, work.memory, work.memory + 2 * work.stars.count, &work.end
+                    self.frame, mirrored, &work.stars, &self.finder.rules, work.memory, work.memory + 2 * work.stars.count,
+                    &work.end,
                 )
             return self._found(mirrored, &work, log_odds)
         finally:
@@ -154,15 +187,16 @@ cdef class Judge:
 
         radius (n,): how far from their places they may be; NULL: as the spread of the residuals allows.
         """
-        cdef int most = self.rules.per_detection * n + self.rules.more_stars, pairs
+        cdef const Rules *rules = &self.finder.rules
+        cdef int most = rules.per_detection * n + rules.more_stars, pairs
         cdef double *room
         _release(work)
-        self.table.find(
-            self.frame, mirrored, work.end.attitude, work.end.focal, &self.date, self.rules.edge_px, most,
-            self.rules.blend_px, &work.stars,
+        self.finder.stars.find(
+            self.frame, mirrored, work.end.attitude, work.end.focal, &self.date, rules.edge_px, most, rules.blend_px,
+            &work.stars,
         )
         pairs = min(n, work.stars.count)
-        if pairs < self.rules.fewest:
+        if pairs < rules.fewest_stars:
             return False
         begin(&work.m, n, work.stars.count)
         work.memory = <double *>malloc((2 * work.stars.count + 4 * pairs + n) * sizeof(double) + 2 * pairs * sizeof(Py_ssize_t))
@@ -174,12 +208,12 @@ cdef class Judge:
         if radius != NULL:
             memcpy(room, radius, n * sizeof(double))
         else:
-            gates(self.frame, self.rules, work.end.spread, n, room)
+            gates(self.frame, rules, work.end.spread, n, room)
         settle(
-            self.frame, mirrored, n, &work.stars, self.rules, room, &work.m, work.memory,
+            self.frame, mirrored, n, &work.stars, rules, room, &work.m, work.memory,
             work.memory + 2 * work.stars.count, &work.end,
         )
-        return work.end.count >= self.rules.fewest
+        return work.end.count >= rules.fewest_stars
 
     cdef Identification _found(self, bint mirrored, const Work *work, double log_odds):
         """What `identified` returns."""
@@ -192,7 +226,7 @@ cdef class Judge:
             out.row[k], out.row[n + k] = end.star[k], work.stars.row[end.near[k]]
             out.turn[9 + k] = work.stars.moved[end.near[k]]
         for k in range(work.stars.count):
-            if on_frame(self.frame, mirrored, &work.memory[2 * k], -self.rules.inside_px):
+            if on_frame(self.frame, mirrored, &work.memory[2 * k], -self.finder.rules.inside_px):
                 out.row[last] = work.stars.row[k]
                 last += 1
         out.due = last - 2 * n
@@ -217,36 +251,6 @@ cdef void _release(Work *work) noexcept:
     work.stars.memory, work.m.memory, work.memory = NULL, NULL, NULL
 
 
-cdef class Limits:
-    """Limits of the search.
-
-    first_stars              LOOKS numbers: the first looks are at triangles of so many of the brightest stars
-    match_sigma              stars lie within so many sigma of their places
-    log_false                logarithm of the share of detections that may be false
-    worth_a_fit, most_stars  log-odds of a pose that is judged, by so many of the brightest catalogue stars on the frame
-    loose_px                 with larger errors of the centroids a candidate counts only if another one supports it
-    most_candidates          a look-up is limited to triangles for which so many candidates are expected by chance
-    most_looked_at           so many candidates, the best ones, are looked at
-    most_looked_up           so many triangles are looked up in a crowd of false stars, or more where it has many
-    most_in_crowd, most_supported  what most_candidates and most_looked_at are, in such a crowd
-    """
-
-    cdef double match_sigma, log_false, worth_a_fit, loose_px, most_candidates, most_in_crowd
-    cdef int[LOOKS] first_stars
-    cdef int most_stars, most_looked_at, most_looked_up, most_supported
-
-    def __init__(
-        self, *, first_stars, double match_sigma, double log_false, double worth_a_fit, int most_stars, double loose_px,
-        double most_candidates, int most_looked_at, int most_looked_up, double most_in_crowd, int most_supported,
-    ):
-        cdef int k
-        for k in range(LOOKS):
-            self.first_stars[k] = first_stars[k]
-        self.match_sigma, self.log_false, self.worth_a_fit, self.most_stars = match_sigma, log_false, worth_a_fit, most_stars
-        self.loose_px, self.most_candidates, self.most_looked_at = loose_px, most_candidates, most_looked_at
-        self.most_looked_up, self.most_in_crowd, self.most_supported = most_looked_up, most_in_crowd, most_supported
-
-
 cdef class Lost:
     """An iterator over what is identified of a frame lost in space, as `Finder.lost` makes it.
 
@@ -258,9 +262,6 @@ cdef class Lost:
     """
 
     cdef Judge judge
-    cdef TriangleTable table
-    cdef BrightTable bright
-    cdef Limits limits
     # the stages as they are given, and as numbers once the looks have failed
     cdef object plan
     cdef int[MAX_STAGES] stars
@@ -275,11 +276,10 @@ cdef class Lost:
     cdef bytearray room
     cdef int count, at
 
-    cdef int _take(self, Judge judge, TriangleTable table, BrightTable bright, stages, bint crowded, Limits limits) except -1:
+    cdef int _take(self, Judge judge, stages, bint crowded) except -1:
         """Take what a new one searches by."""
-        cdef int most = max(limits.most_looked_at, limits.most_supported) + 1
-        self.judge, self.table, self.bright, self.limits = judge, table, bright, limits
-        self.crowded, self.looks, self.stages = crowded, LOOKS if crowded else 0, len(stages)
+        cdef int most = max(judge.finder.limits.most_looked_at, judge.finder.limits.most_supported) + 1
+        self.judge, self.crowded, self.looks, self.stages = judge, crowded, LOOKS if crowded else 0, len(stages)
         if not 0 < self.stages <= MAX_STAGES:
             raise ValueError(f"{self.stages} stages of a search: 1 to {MAX_STAGES} are possible")
         self.plan = stages
@@ -317,11 +317,12 @@ cdef class Lost:
 
     cdef int _look_first(self) except -1:
         """Take the best candidate of the next few stars, if others support it and it was not that of the look before."""
-        cdef int stars = min(self.limits.first_stars[self.looks], self.judge.frame.count)
+        cdef const Limits *limits = &self.judge.finder.limits
+        cdef int stars = min(limits.first_stars[self.looks], self.judge.frame.count)
         cdef Candidate before = self.found[0]
         cdef bint any_before = self.count > 0
-        self.count = self.table.best(
-            self.judge.frame, 0, stars, self.error_px, self.limits.most_candidates, 1, True, self.found
+        self.count = self.judge.finder.triangles.best(
+            self.judge.frame, 0, stars, self.error_px, limits.most_candidates, 1, True, self.found
         )
         self.at = self.count if any_before and self.count > 0 and _same(&before, &self.found[0]) else 0
         self.looks, self.ranked, self.order[0] = self.looks + 1, True, 0
@@ -330,7 +331,8 @@ cdef class Lost:
     cdef int _look_up(self) except -1:
         """Take the candidates of the next stage."""
         cdef FrameStars frame = self.judge.frame
-        cdef Limits limits = self.limits
+        cdef const Limits *limits = &self.judge.finder.limits
+        cdef TriangleTable table = self.judge.finder.triangles
         cdef double error_px
         cdef int k, done = 0, stars
         if self.stage == 0:
@@ -338,14 +340,14 @@ cdef class Lost:
                 self.stars[k], self.stage_px[k] = self.plan[k]
         error_px, stars = self.stage_px[self.stage], min(self.stars[self.stage], frame.count)
         if self.crowded:
-            self.count = self.table.supported(
+            self.count = table.supported(
                 frame, stars, error_px, limits.most_looked_up, limits.most_in_crowd, limits.most_supported, self.found
             )
         else:
             for k in range(self.stage):
                 if self.stage_px[k] == error_px:
                     done = min(self.stars[k], frame.count)
-            self.count = self.table.best(
+            self.count = table.best(
                 frame, done, stars, error_px, limits.most_candidates, limits.most_looked_at, error_px > limits.loose_px,
                 self.found,
             )
@@ -357,26 +359,27 @@ cdef class Lost:
 
     cdef void _pose(self, const Candidate *c, double *attitude, double *focal) noexcept:
         """Set the pose of a candidate, and the radii of the stars that decide."""
-        self.bright.pose(
-            self.judge.frame, c, &self.judge.date, self.error_px, self.limits.match_sigma, self.judge._deciding(), attitude,
-            focal, self.radius,
+        self.judge.finder.bright.pose(
+            self.judge.frame, c, &self.judge.date, self.error_px, self.judge.finder.limits.match_sigma, self.judge._deciding(),
+            attitude, focal, self.radius,
         )
 
     cdef int _rank(self) except -1:
         """Keep of the candidates behind the first, which mostly is right, those that are worth a fit, best first."""
         cdef double[9] attitude
         cdef double focal, worth
+        cdef const Limits *limits = &self.judge.finder.limits
         room = room_for(self.count * sizeof(double))
         cdef double *kept = <double *>start_of(room)
         cdef int k, j, end = 1
         self.ranked = True
         for k in range(1, self.count):
             self._pose(&self.found[k], attitude, &focal)
-            worth = self.bright.worth(
+            worth = self.judge.finder.bright.worth(
                 self.judge.frame, &self.found[k], &self.judge.date, attitude, focal, self.judge._deciding(), self.radius,
-                self.limits.most_stars, self.limits.match_sigma, self.limits.log_false,
+                limits.most_stars, limits.match_sigma, limits.log_false,
             )
-            if not worth > self.limits.worth_a_fit:
+            if not worth > limits.worth_a_fit:
                 continue
             j = end
             while j > 1 and worth > kept[j - 1]:
@@ -395,28 +398,3 @@ cdef bint _same(const Candidate *one, const Candidate *other) noexcept:
         for j in range(3):
             pairs += one.star[i] == other.star[j] and one.corner[i] == other.corner[j]
     return pairs == 3 and one.mirrored == other.mirrored
-
-
-cdef class Finder:
-    """Tables and rules by which frames lost in space are found."""
-
-    cdef StarTable stars
-    cdef TriangleTable triangles
-    cdef BrightTable bright
-    cdef Rules rules
-    cdef Chances chances
-    cdef Limits limits
-
-    def __init__(
-        self, StarTable stars, TriangleTable triangles, BrightTable bright, Rules rules, Chances chances, Limits limits
-    ):
-        self.stars, self.triangles, self.bright = stars, triangles, bright
-        self.rules, self.chances, self.limits = rules, chances, limits
-
-    def lost(self, FrameStars frame, double years, velocity, prior, double enough, stages, bint crowded):
-        """An iterator over what is identified, as `Judge` has it with the same arguments; stages, crowded: see `Lost`."""
-        cdef Judge judge = Judge.__new__(Judge)
-        cdef Lost out = Lost.__new__(Lost)
-        judge._take(frame, self.stars, years, velocity, prior, enough, self.rules, self.chances)
-        out._take(judge, self.triangles, self.bright, stages, crowded, self.limits)
-        return out

@@ -13,7 +13,7 @@ by the same evidence as any other. Then the lens extends the answer to the whole
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain, product
 from typing import TypeVar
 
@@ -21,7 +21,6 @@ import numpy as np
 
 from starpos import rotation
 from starpos.frames.frame import Window
-from starpos.frozen import at_once
 from starpos.identification import fisheye
 from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import (
@@ -60,16 +59,6 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-@at_once
-@dataclass(frozen=True)
-class _Try:
-    """Stars that are searched: rows of them, their share of the frame's area, and the log-odds that they need."""
-
-    rows: np.ndarray
-    share: float
-    enough: float
-
-
 def identify_blind(
     xy: np.ndarray,
     sigma_px: np.ndarray,
@@ -103,28 +92,29 @@ def identify_blind(
         spans.insert(0, (max(told, near_px / ROUGHLY), min(longest, near_px * ROUGHLY)))
     camera = Camera.from_focal(width, height, shortest)
     frame = stars_at(camera, xy, sigma_px)
-    tries = [_Try(np.arange(len(xy)), 1.0, MIN_LOG_ODDS)]
+    # stars that are searched, their share of the frame's area, and the log-odds that they need
+    tries = [(np.arange(len(xy)), 1.0, MIN_LOG_ODDS)]
     if (even := second_try(through(frame, camera, window))) is not None:
         # only one star is taken from a cell, which leaves less area for the others
-        tries.append(_Try(even, 0.5, MIN_LOG_ODDS + SECOND_TRY))
+        tries.append((even, 0.5, MIN_LOG_ODDS + SECOND_TRY))
     # the quick stages of all tries come before the slow ones of any
     work = [
         (t, stage, span)
         for k in range(len(stages))
         for t in tries
-        for stage, span in product(stages_of(stages, len(t.rows))[k : k + 1], spans)
+        for stage, span in product(stages_of(stages, len(t[0]))[k : k + 1], spans)
     ]
     best: tuple[Camera, Identification] | None = None
-    for k, (t, (stars, error_px), (low, high)) in enumerate(work):
+    for k, ((rows, share, enough), (stars, error_px), (low, high)) in enumerate(work):
         progress("searching all scales", k / len(work))
         prior = any_scale(low, high, -math.log(len(spans)))
-        for pose, radius_px in _poses(frame.of_rows(t.rows), sky, quads, (low, high), stars, error_px, limit):
+        for pose, radius_px in _poses(frame.of_rows(rows), sky, quads, (low, high), stars, error_px, limit):
             camera = Camera.from_focal(width, height, pose.focal_px)
-            seen = through(stars_at(camera, xy[t.rows], sigma_px[t.rows]), camera, window)
-            seen = seen.but(area_px2=t.share * seen.area_px2)
-            found = verify_pose(seen, sky, pose, radius_px, prior, t.enough)
+            seen = through(stars_at(camera, xy[rows], sigma_px[rows]), camera, window)
+            seen = seen.but(area_px2=share * seen.area_px2)
+            found = verify_pose(seen, sky, pose, radius_px, prior, enough)
             if found and (best is None or found.log_odds > best[1].log_odds):
-                best = camera, found.but(star=t.rows[found.star])
+                best = camera, found.but(star=rows[found.star])
                 if is_sure(found, seen):
                     return best
         if limit.reached:
@@ -252,35 +242,6 @@ def _share_beyond(radius_px: float, width: int, height: int) -> float:
     return float(np.mean(x[:, None] ** 2 + y**2 > radius_px**2))
 
 
-@at_once
-@dataclass(frozen=True)
-class _Picture:
-    """N stars at pixels xy (N, 2), with errors (N,) px, of a frame of that size, and the radius of its picture in px."""
-
-    xy: np.ndarray
-    sigma_px: np.ndarray
-    width: int
-    height: int
-    radius_px: float
-
-    def seen_by(self, focal_px: float, lens: tuple[float, ...]) -> fisheye.WideField:
-        """The stars as a lens sees them, its axis in the middle of the frame."""
-        camera = replace(
-            Camera.from_focal(self.width, self.height, focal_px, EQUIDISTANT), distortion=tuple(lens)
-        )
-        return fisheye.WideField(camera.directions(*self.xy.T), self.sigma_px, camera)
-
-
-@at_once
-@dataclass(frozen=True)
-class _Part:
-    """A part of a frame, `whole` as a supposed lens sees it, and its stars, as if the picture had RADIUS_PX."""
-
-    whole: fisheye.WideField
-    part: fisheye.Part
-    field: FrameStars
-
-
 def identify_fisheye(
     xy: np.ndarray,
     sigma_px: np.ndarray,
@@ -304,10 +265,15 @@ def identify_fisheye(
         return None
     disc_px = disc_radius_px(xy, width, height)
     radius_px = disc_px or math.hypot(width, height) / 2
-    picture = _Picture(xy, sigma_px, width, height, radius_px)
+
+    def seen_by(focal_px: float, lens: tuple[float, ...]) -> fisheye.WideField:
+        """The stars as a lens sees them, its axis in the middle of the frame."""
+        camera = replace(Camera.from_focal(width, height, focal_px, EQUIDISTANT), distortion=lens)
+        return fisheye.WideField(camera.directions(*xy.T), sigma_px, camera)
+
     spans = [_focal_range(lens, radius_px, near_px) for lens in LENSES]
     wholes = [
-        picture.seen_by(focal_px, lens)
+        seen_by(focal_px, lens)
         for lens, (shortest, longest) in zip(LENSES, spans, strict=True)
         for focal_px in np.geomspace(
             shortest, longest, math.ceil(math.log(longest / shortest) / (2 * FISHEYE_STEP)) + 1
@@ -319,13 +285,13 @@ def identify_fisheye(
     )
     # the evidence that a frame needs, raised for the number of parts and lenses tried
     need = fisheye.enough(len(_TURNS) * len(LENSES)) + SECOND_TRY
-    parts: list[list[_Part]] = []
+    parts: list[list[fisheye.Part]] = []
     work = [(stars, k) for stars in stages for k in range(len(_TURNS))]
     best: tuple[Camera, Identification] | None = None
     for done, (stars, k) in enumerate(work):
         progress("searching fisheyes", done / len(work))
         if k == len(parts):
-            parts.append(_parts(picture, wholes, _TURNS[k], limit))
+            parts.append(_parts(wholes, radius_px, _TURNS[k], limit))
         guesses = _guesses(parts[k], stars, sky, quads, limit)
         for guess, poses, row in _most_agreed(guesses):
             if limit.reached:
@@ -334,7 +300,7 @@ def identify_fisheye(
             found = verify_pose(guess.field, sky, pose, radius, prior, need)
             if found is None or (best is not None and found.log_odds <= best[1].log_odds):
                 continue
-            whole = outwards(guess.whole, sky, guess.part, found)
+            whole = outwards(sky, guess, found)
             if whole is not None and whole[2]:
                 return whole[:2]
             # off the middle, a wrong lens would turn the axis elsewhere
@@ -353,30 +319,30 @@ def _focal_range(lens: tuple[float, ...], radius_px: float, near_px: float | Non
 
 
 def _parts(
-    picture: _Picture, wholes: Sequence[fisheye.WideField], turn: np.ndarray, limit: CpuLimit
-) -> list[_Part]:
-    """A part of the picture as each lens sees it, where enough of it shows sky and stars."""
-    shrink = picture.radius_px / RADIUS_PX
-    width, height = (round(size / shrink) for size in (picture.width, picture.height))
+    wholes: Sequence[fisheye.WideField], radius_px: float, turn: np.ndarray, limit: CpuLimit
+) -> list[fisheye.Part]:
+    """A part of a picture of that radius as each lens sees it, as if it had RADIUS_PX; where sky and stars are enough."""
+    shrink = radius_px / RADIUS_PX
 
-    def part_of(whole: fisheye.WideField) -> _Part | None:
+    def part_of(whole: fisheye.WideField) -> fisheye.Part | None:
+        width, height = (round(size / shrink) for size in (whole.camera.width, whole.camera.height))
         pinhole = fisheye.pinhole_of(Camera.from_focal(width, height, whole.camera.fx / shrink, EQUIDISTANT))
-        share = _share_seen(picture, whole.camera, pinhole, turn)
+        share = _share_seen(whole.camera, radius_px, pinhole, turn)
         if share < MIN_SEEN:
             return None
-        part = fisheye.part_at(replace(whole, sigma_px=whole.sigma_px / shrink), pinhole, turn)
-        field = part.field.but(area_px2=share * part.field.area_px2)
-        return _Part(whole, part, field) if len(field) >= MIN_STARS else None
+        part = fisheye.part_at(whole, pinhole, turn, shrink)
+        enough = len(part.field) >= MIN_STARS
+        return replace(part, field=part.field.but(area_px2=share * part.field.area_px2)) if enough else None
 
     return [part for part in _side_by_side(part_of, wholes, limit) if part is not None]
 
 
 def _guesses(
-    parts: Sequence[_Part], stars: int, sky: Sky, quads: QuadCatalogue, limit: CpuLimit
-) -> list[tuple[_Part, QuadPoses]]:
+    parts: Sequence[fisheye.Part], stars: int, sky: Sky, quads: QuadCatalogue, limit: CpuLimit
+) -> list[tuple[fisheye.Part, QuadPoses]]:
     """The poses that the brightest stars of each part give, where there are any."""
 
-    def poses_of(part: _Part) -> QuadPoses:
+    def poses_of(part: fisheye.Part) -> QuadPoses:
         field = part.field
         alike = matches(field, quads, min(stars, len(field)), FISHEYE_ERROR_PX, field.focal_px, FISHEYE_STEP)
         scales = field.focal_px * (1 - FISHEYE_STEP), field.focal_px * (1 + FISHEYE_STEP)
@@ -386,17 +352,19 @@ def _guesses(
     return [(part, poses) for part, poses in zip(parts, found, strict=False) if len(poses)]
 
 
-def _share_seen(picture: _Picture, camera: Camera, pinhole: Camera, turn: np.ndarray) -> float:
-    """The share of a part's frame that lies in the picture."""
+def _share_seen(camera: Camera, radius_px: float, pinhole: Camera, turn: np.ndarray) -> float:
+    """The share of a part's frame that lies in a camera's picture of that radius."""
     x, y = np.meshgrid(*(np.linspace(0, size - 1, GRID) for size in (pinhole.width, pinhole.height)))
     xy = camera.project(pinhole.directions(x.ravel(), y.ravel()) @ turn)
     with np.errstate(invalid="ignore"):
-        on = ((xy > -0.5) & (xy < [picture.width - 0.5, picture.height - 0.5])).all(1)
-        on &= np.hypot(*(xy - [camera.cx, camera.cy]).T) < picture.radius_px
+        on = ((xy > -0.5) & (xy < [camera.width - 0.5, camera.height - 0.5])).all(1)
+        on &= np.hypot(*(xy - [camera.cx, camera.cy]).T) < radius_px
     return float(on.mean())
 
 
-def _most_agreed(guesses: Sequence[tuple[_Part, QuadPoses]]) -> Iterator[tuple[_Part, QuadPoses, int]]:
+def _most_agreed(
+    guesses: Sequence[tuple[fisheye.Part, QuadPoses]],
+) -> Iterator[tuple[fisheye.Part, QuadPoses, int]]:
     """Yield parts, their poses and a row of these, those with most votes of all parts first."""
     if not guesses:
         return

@@ -23,11 +23,12 @@ import numpy as np
 from starpos.frozen import at_once
 from starpos.identification._found import Identification
 from starpos.identification._frame import FrameStars
-from starpos.identification._poses import Chances, Rules
-from starpos.identification._search import Anywhere, Judge
-from starpos.identification.pose import SMALL_STEP, STEPS, TEST_STARS, Pose
+from starpos.identification._screen import BrightTable
+from starpos.identification._search import Anywhere, Finder
+from starpos.identification.pose import MATCH_SIGMA, SMALL_STEP, STEPS, TEST_STARS, Pose
 from starpos.identification.sky import Sky
-from starpos.identification.triangles import SCALE_TOLERANCE
+from starpos.identification.triangles import SCALE_TOLERANCE, TriangleCatalogue
+from starpos.sky.catalogue import Catalogue
 from starpos.units import SIGMA_PER_MAD
 
 # Extra centroid errors (px) and their prior probabilities: none, errors of the catalogue, unknown lenses.
@@ -40,7 +41,7 @@ MIRRORED = 0.1
 WIDTH = np.append(np.full(3, np.cbrt(8 * np.pi**2)), 2 * SCALES[0][0])
 # Closer detections may be the same star, so the second says nothing new.
 DOUBLE_PX = 3.0
-CHANCES = Chances(ERRORS_PX, LOG_SHARES, DOUBLE_PX)
+CHANCES = {"errors_px": ERRORS_PX, "log_shares": LOG_SHARES, "double_px": DOUBLE_PX}
 
 
 @at_once
@@ -101,24 +102,47 @@ PER_DETECTION, MORE_STARS = 3, 50
 EDGE_PX, INSIDE_PX = 2.0, 5.0
 
 
-RULES = Rules(
-    rounds=ROUNDS,
-    fewest_stars=MIN_STARS,
-    steps=STEPS,
-    small_step=SMALL_STEP,
-    floor_px=FLOOR_PX,
-    sigma_per_mad=SIGMA_PER_MAD,
-    least_spread_px=MIN_SPREAD_PX,
-    gate_sigma=GATE_SIGMA,
-    gate_px=GATE_PX,
-    edge_px=EDGE_PX,
-    inside_px=INSIDE_PX,
-    blend_px=BLEND_PX,
-    per_detection=PER_DETECTION,
-    more_stars=MORE_STARS,
-    most_stars=FAINTEST_FIT,
-    bent_px=BENT_PX,
-)
+RULES = {
+    "rounds": ROUNDS,
+    "fewest_stars": MIN_STARS,
+    "steps": STEPS,
+    "small_step": SMALL_STEP,
+    "floor_px": FLOOR_PX,
+    "sigma_per_mad": SIGMA_PER_MAD,
+    "least_spread_px": MIN_SPREAD_PX,
+    "gate_sigma": GATE_SIGMA,
+    "gate_px": GATE_PX,
+    "edge_px": EDGE_PX,
+    "inside_px": INSIDE_PX,
+    "blend_px": BLEND_PX,
+    "per_detection": PER_DETECTION,
+    "more_stars": MORE_STARS,
+    "most_stars": FAINTEST_FIT,
+    "bent_px": BENT_PX,
+}
+LIMITS = {
+    "first_stars": (4, 5, 7),
+    "match_sigma": MATCH_SIGMA,
+    "log_false": math.log(0.35),
+    "worth_a_fit": 4.0,
+    "most_stars": 440,
+    "loose_px": 1.0,
+    "most_candidates": 25_000,
+    "most_looked_at": 25,
+    "most_looked_up": 10_000,
+    "most_in_crowd": 60_000,
+    "most_supported": 40,
+}
+
+
+@lru_cache(maxsize=4)
+def finder_of(catalogue: Catalogue, triangles: TriangleCatalogue | None) -> Finder:
+    """The compiled judge and search of a sky's stars at any date."""
+    stars = Sky(catalogue, triangles).stars
+    if triangles is None:
+        return Finder(stars, None, None, RULES, CHANCES, LIMITS)
+    bright = BrightTable(stars, triangles.star, triangles.rank, triangles.cell_start)
+    return Finder(stars, triangles.compiled, bright, RULES, CHANCES, LIMITS)
 
 
 @at_once
@@ -168,7 +192,8 @@ def verify_pose(
 
     None unless the evidence is beyond doubt: log-odds of `enough`.
     """
-    judge = Judge(field, sky.stars, sky.years, sky.velocity, prior, enough, RULES, CHANCES)
+    finder = finder_of(sky.catalogue, sky.triangles)
+    judge = finder.judge(field, sky.years, sky.velocity, prior, enough)
     return judge.identified(near_pose.attitude, near_pose.focal_px, near_pose.mirrored, radius_px)
 
 

@@ -87,22 +87,16 @@ class WideField:
 class Part:
     """The stars of a part of a frame, as an ideal camera that looks there sees them.
 
-    turn        (3, 3): C into that camera
-    row         (n,): which of the frame's stars they are
-    directions  (n, 3): in that camera
-    sigma_px    (n,): their errors on its frame
+    whole  all of the frame
+    turn   (3, 3): C into that camera
+    row    (n,): which of the frame's stars they are
+    field  the stars on that camera's frame
     """
 
-    camera: Camera
+    whole: WideField
     turn: np.ndarray
     row: np.ndarray
-    directions: np.ndarray
-    sigma_px: np.ndarray
-
-    @property
-    def field(self) -> FrameStars:
-        """The stars on the frame of the part's camera."""
-        return stars_at(self.camera, self.camera.project(self.directions), self.sigma_px)
+    field: FrameStars
 
     def turned(
         self, priors: Sequence[PointingPrior | PlumbPrior | AimPrior]
@@ -123,14 +117,15 @@ def parts(field: WideField) -> list[Part]:
     return [part_at(field, pinhole, turn) for turn in _turns(field.camera, pinhole)]
 
 
-def part_at(field: WideField, pinhole: Camera, turn: np.ndarray) -> Part:
-    """The part that an ideal camera sees into which a rotation (3, 3) takes C."""
+def part_at(field: WideField, pinhole: Camera, turn: np.ndarray, shrink: float = 1.0) -> Part:
+    """The part that an ideal camera sees into which a rotation (3, 3) takes C; its pixels are `shrink` times as large."""
     seen = field.directions @ turn.T
     xy = pinhole.project(seen)
     with np.errstate(invalid="ignore"):
         row = np.flatnonzero(((xy >= 0) & (xy <= [pinhole.width - 1, pinhole.height - 1])).all(1))
     # a pinhole's picture is stretched away from its middle
-    return Part(pinhole, turn, row, seen[row], field.sigma_px[row] / seen[row, 2] ** 2)
+    sigma_px = field.sigma_px[row] / shrink / seen[row, 2] ** 2
+    return Part(field, turn, row, stars_at(pinhole, xy[row], sigma_px))
 
 
 def pinhole_of(camera: Camera) -> Camera:
@@ -176,7 +171,7 @@ def part_of(field: WideField, sky: Sky, found: Identification) -> tuple[Part, Id
         catalogue=catalogue,
         blend_px=found.blend_px[inside],
         attitude=pose.attitude,
-        mean_square_px2=_mean_square(residual),
+        mean_square_px2=float(np.square(residual).mean()),
         expected=found.expected[(from_middle < stars.half - INSIDE_PX).all(1)],
     )
 
@@ -252,7 +247,7 @@ class LensPose:
             attitude=self.attitude,
             focal_scale=self.camera.fx / field.camera.fx,
             residual_px=_rms_px(residual, np.hypot(sigma, FLOOR_PX)),
-            mean_square_px2=_mean_square(residual),
+            mean_square_px2=float(np.square(residual).mean()),
             log_odds=found.log_odds,
             expected=there.index[_within(self.project(there.directions), field.camera, -INSIDE_PX)],
             mirrored=found.mirrored,
@@ -260,14 +255,14 @@ class LensPose:
 
 
 def _start(
-    field: WideField, part: Part, found: Identification
+    part: Part, found: Identification
 ) -> tuple[np.ndarray, np.ndarray, LensPose, np.ndarray, np.ndarray, np.ndarray]:
     """What a part of a frame says of all its stars.
 
     Returns the pixels (N, 2) of the frame's stars, their errors (N,), and the pose of the whole frame. Then, of the
     identified stars, the rows (M,) and those in the catalogue (M,), and which stars (N,) are not on the part.
     """
-    flip = FLIP if found.mirrored else np.eye(3)
+    field, flip = part.whole, FLIP if found.mirrored else np.eye(3)
     attitude = flip @ part.turn.T @ flip @ found.attitude
     # ignore stars that fall outside the picture once refraction is removed
     xy = np.nan_to_num(field.camera.project(field.directions[:FAINTEST_FIT]), nan=FAR_PX)
@@ -278,12 +273,12 @@ def _start(
     return xy, field.sigma_px[:FAINTEST_FIT], pose, row[use], found.catalogue[use], beyond
 
 
-def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) -> Identification | None:
+def everywhere(sky: Sky, part: Part, found: Identification) -> Identification | None:
     """Extend the identification of a part to the whole frame of a known lens.
 
     None if the lens puts the identified stars in other places.
     """
-    xy, sigma, pose, star, index, beyond = _start(field, part, found)
+    xy, sigma, pose, star, index, beyond = _start(part, found)
     w = sky.directions(index)
     for _ in range(ROUNDS):
         pose = pose.fitted(xy[star], w, np.hypot(sigma[star], _error_px(xy[star] - pose.project(w))))
@@ -300,12 +295,10 @@ def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) ->
         star, index, w = pair[0], there.index[pair[1]], there.directions[pair[1]]
         if same:
             break
-    return pose.identified(field, xy, there, np.stack(pair), found)
+    return pose.identified(part.whole, xy, there, np.stack(pair), found)
 
 
-def outwards(
-    field: WideField, sky: Sky, part: Part, found: Identification
-) -> tuple[Camera, Identification, bool] | None:
+def outwards(sky: Sky, part: Part, found: Identification) -> tuple[Camera, Identification, bool] | None:
     """Extend the identification of a part to the whole frame, and find out its lens on the way.
 
     Stars near identified ones are matched first. Each ring of them improves the lens (focal length, axis and distortion),
@@ -314,13 +307,13 @@ def outwards(
     Returns the camera fitted to its stars, the identification, and whether stars beyond the part bear it out; if they do
     not, the first two are of the first ring.  None if the lens puts the stars of the part in other places.
     """
-    xy, sigma, pose, star, index, beyond = _start(field, part, found)
+    xy, sigma, pose, star, index, beyond = _start(part, found)
     w = sky.directions(index)
     middle = part.turn[2] * [1, -1, 1] if found.mirrored else part.turn[2]
     inner = None
     for k in range(math.ceil((math.pi - FIRST_RAD) / NEXT_RAD) + LAST_ROUNDS):
         error = np.hypot(sigma[star], _error_px(xy[star] - pose.project(w)))
-        pose = pose.fitted(xy[star], w, error, field.camera)
+        pose = pose.fitted(xy[star], w, error, part.whole.camera)
         spread = max(_spread_px(xy[star] - pose.project(w)), MIN_LENS_SPREAD_PX)
         gate = GATE_SIGMA * np.hypot(spread, sigma) + GATE_RAD * pose.camera.fx
         near = _stars_on(pose, sky, len(xy))
@@ -334,7 +327,7 @@ def outwards(
             inner = pose, near, pair
     borne_out = _borne_out(int(beyond[star].sum()), xy[beyond], len(near.index), gate[beyond])
     pose, near, pair = (pose, near, pair) if borne_out or inner is None else inner
-    whole = replace(field, camera=pose.camera)
+    whole = replace(part.whole, camera=pose.camera)
     return pose.camera, pose.identified(whole, xy, near, pair, found), borne_out
 
 
@@ -365,11 +358,6 @@ def _rms_px(residual: np.ndarray, sigma_px: np.ndarray) -> float:
     """Root mean square of residuals (M, 2) along one axis, with the weights of the fit."""
     weight = 1 / np.square(sigma_px)
     return float(np.sqrt(np.square(residual).sum(1) @ weight / (2 * weight.sum())))
-
-
-def _mean_square(residual: np.ndarray) -> float:
-    """Mean square (px2) of residuals (M, 2) along one axis, all alike."""
-    return float(np.square(residual).mean())
 
 
 def _within(pixel: np.ndarray, camera: Camera, margin_px: float) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from starpos import rotation
 from starpos.frozen import at_once
 from starpos.identification._found import Identification
-from starpos.identification._frame import FrameStars
+from starpos.identification._frame import FrameStars, framed
 from starpos.instrument.camera import Camera
 
 # Most steps of a fit; a step below this (rad) is the last one.
@@ -19,26 +19,17 @@ TEST_STARS, CROWD_STARS = 50, 200
 MIN_SIGMA_PX = 1e-3
 # Maximum distance of a star from its predicted place, in sigma.
 MATCH_SIGMA = 3.5
+# Stars so far beyond the frame (px) need no margin; a margin is at most this share of the frame.
+NO_MARGIN_PX, WIDEST_MARGIN = 2.0, 0.25
 
 
-def stars_at(camera: Camera, xy: np.ndarray, sigma: np.ndarray) -> FrameStars:
-    """FrameStars at pixels xy (N, 2) of an ideal camera with square pixels, with errors (N,) px, brightest first.
+def stars_at(camera: Camera, seen: np.ndarray, sigma: np.ndarray) -> FrameStars:
+    """FrameStars, brightest first, of pixels (N, 2) or unit vectors (N, 3) in C, for a camera without distortion.
 
-    ValueError if a pixel or an error is not a finite number.
+    sigma (N,): their errors, px.  ValueError if one of them is not a finite number, or lies behind the camera.
     """
-    if not (np.isfinite(xy).all() and np.isfinite(sigma).all()):
-        raise ValueError("stars to be identified need finite pixels and errors: leave the others out")
-    principal = np.array([camera.cx, camera.cy])
-    flipped = np.stack([xy[:, 0], camera.height - 1 - xy[:, 1]], -1)
-    return FrameStars(
-        xy=np.stack([xy, flipped]) - principal,
-        sigma=np.maximum(sigma, MIN_SIGMA_PX),
-        middle=np.array(camera.centre_px) - principal,
-        half=np.array([camera.width, camera.height]) / 2,
-        focal_px=camera.fx,
-        area_px2=float(camera.width * camera.height),
-        tested=TEST_STARS,
-    )
+    seen, sigma = np.ascontiguousarray(seen, float), np.ascontiguousarray(sigma, float)
+    return framed(seen, sigma, camera, MIN_SIGMA_PX, TEST_STARS, NO_MARGIN_PX, WIDEST_MARGIN)
 
 
 @at_once

@@ -10,7 +10,6 @@ looks only where nothing was detected, so it multiplies with the evidence of the
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache
 from itertools import chain
 
 import numpy as np
@@ -18,50 +17,31 @@ import numpy as np
 from starpos.errors import InstrumentError
 from starpos.frames.frame import Window
 from starpos.identification import fisheye
-from starpos.identification._frame import FrameStars, projected
-from starpos.identification._search import Finder, Limits
+from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import (
-    CHANCES,
     MIN_LOG_ODDS,
     MIN_STARS,
-    RULES,
     Identification,
     OnFrame,
     anywhere,
+    finder_of,
     verify_pose,
 )
-from starpos.identification.pose import CROWD_STARS, MATCH_SIGMA, MIN_SIGMA_PX, TEST_STARS, Pose
+from starpos.identification.pose import CROWD_STARS, TEST_STARS, Pose, stars_at
 from starpos.identification.prior import AimPrior, PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
-from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import Camera
-from starpos.sky.catalogue import Catalogue
 
 # (number of brightest stars, their error in px); the last stages are for lenses with distortion.
 STAGES = (5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (20, 0.3), (9, 2.5), (8, 6.0)
 # The share of the probability that priors have, and a header's pointing with or without others.
 NEAR, AIMED = 0.5, 0.9
-# Stars so far beyond the frame (px) need no margin; a margin is at most this share of the frame.
-EDGE_PX, WIDEST_MARGIN = 2.0, 0.25
 
 # Triangles of the brightest stars, and the error in px, where a crowd of them is false.
 CROWD_STAGES = (60, 0.3), (140, 0.1)
 # Cells along each side of a frame, of each of which the brightest star is taken if this leaves less than that share of
 # the brightest: else these are spread evenly already. Half of the cells decide. Such a second try needs more evidence.
 CELLS, MAX_EVEN, SECOND_TRY = 10, 0.65, math.log(10)
-LIMITS = Limits(
-    first_stars=(4, 5, 7),
-    match_sigma=MATCH_SIGMA,
-    log_false=math.log(0.35),
-    worth_a_fit=4.0,
-    most_stars=440,
-    loose_px=1.0,
-    most_candidates=25_000,
-    most_looked_at=25,
-    most_looked_up=10_000,
-    most_in_crowd=60_000,
-    most_supported=40,
-)
 
 Priors = Sequence[PointingPrior | PlumbPrior | AimPrior]
 Stages = Sequence[tuple[int, float]]
@@ -76,7 +56,7 @@ def field_of(
     """
     if fisheye.is_wide(camera):
         return fisheye.WideField(directions, sigma_px, camera)
-    return through(frame_stars(directions, sigma_px, camera), camera, window)
+    return through(stars_at(camera, directions, sigma_px), camera, window)
 
 
 def through(field: FrameStars, camera: Camera, window: Window | None) -> FrameStars:
@@ -98,26 +78,6 @@ def through(field: FrameStars, camera: Camera, window: Window | None) -> FrameSt
     high[[right >= camera.width, bottom >= camera.height]] = np.inf
     share = (right - left) * (bottom - top) / (camera.width * camera.height)
     return field.within(low, high, share)
-
-
-def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) -> FrameStars:
-    """Make FrameStars from unit vectors (N, 3) in C and errors (N,) px. ValueError if one is not a finite number."""
-    # a camera with square pixels, as `identify` needs
-    squeeze = camera.fx / camera.fy
-    width, height = camera.width, max(1, round(camera.height * squeeze))
-    cx, cy = camera.cx, camera.cy * squeeze
-    xy, sigma, beyond = projected(directions, sigma_px, camera.fx, cx, cy, width, height, MIN_SIGMA_PX)
-    # without distortion, stars that a lens has drawn in may lie beyond the frame: it gets a margin
-    margin = math.ceil(min(beyond - EDGE_PX, WIDEST_MARGIN * max(width, height))) if beyond > EDGE_PX else 0
-    return FrameStars(
-        xy=xy,
-        sigma=sigma,
-        middle=np.array([(width - 1) / 2 - cx, (height - 1) / 2 - cy]),
-        half=np.array([width / 2 + margin, height / 2 + margin]),
-        focal_px=camera.fx,
-        area_px2=float(width * height),
-        tested=TEST_STARS,
-    )
 
 
 def identify(field: FrameStars | fisheye.WideField, sky: Sky, priors: Priors = ()) -> Identification | None:
@@ -219,7 +179,9 @@ def _lost(
     field: FrameStars, sky: Sky, log_share: float, enough: float, stages: Stages, crowded: bool
 ) -> Iterator[Identification]:
     """Identifications lost in space, which has that share of the probability."""
-    prior, finder = anywhere(field.focal_px, log_share), _finder(sky.catalogue, sky.triangles)
+    if sky.triangles is None:
+        return iter(())
+    prior, finder = anywhere(field.focal_px, log_share), finder_of(sky.catalogue, sky.triangles)
     return finder.lost(field, sky.years, sky.velocity, prior, enough, stages, crowded)
 
 
@@ -246,12 +208,6 @@ def _near(field: FrameStars, sky: Sky, priors: Priors, enough: float) -> Iterato
                 yield found
 
 
-@lru_cache(maxsize=4)
-def _finder(catalogue: Catalogue, triangles: TriangleCatalogue) -> Finder:
-    sky = Sky(catalogue, triangles)
-    return Finder(sky.stars, triangles.compiled, sky.brightest, RULES, CHANCES, LIMITS)
-
-
 def _by_parts(
     field: fisheye.WideField,
     sky: Sky,
@@ -263,7 +219,7 @@ def _by_parts(
     for part in parts:
         found = identified(part.field, sky, part.turned(priors))
         if found and found.log_odds >= fisheye.enough(len(parts)):
-            return fisheye.everywhere(field, sky, part, found)
+            return fisheye.everywhere(sky, part, found)
     return None
 
 

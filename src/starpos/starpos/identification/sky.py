@@ -8,7 +8,6 @@ import numpy as np
 
 from starpos.earth.orientation import earth_motion
 from starpos.frozen import at_once
-from starpos.identification._screen import BrightTable
 from starpos.identification._sky import StarTable
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.sky.catalogue import EPOCH, Catalogue
@@ -19,15 +18,18 @@ PAGE_BYTES = 4096
 @at_once
 @dataclass(frozen=True)
 class Sky:
-    """The catalogue at a date: with proper motion to `year` and aberration by `velocity` (3,) in units of c."""
+    """The catalogue at a date: with proper motion to `year` and aberration by `velocity` (3,) in units of c.
+
+    Without triangles nothing is found lost in space.
+    """
 
     catalogue: Catalogue
-    triangles: TriangleCatalogue
+    triangles: TriangleCatalogue | None
     year: float = EPOCH
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @classmethod
-    def at(cls, catalogue: Catalogue, triangles: TriangleCatalogue, utc_unix_s: float | None) -> "Sky":
+    def at(cls, catalogue: Catalogue, triangles: TriangleCatalogue | None, utc_unix_s: float | None) -> "Sky":
         """The sky at a time; if it is unknown (None), at J2000 without aberration."""
         if utc_unix_s is None:
             return _undated(catalogue, triangles)
@@ -40,16 +42,6 @@ class Sky:
         return _stars(self.catalogue)
 
     @property
-    def brightest(self) -> BrightTable:
-        """The triangle catalogue's stars, for compiled code."""
-        return _brightest(self.catalogue, self.triangles)
-
-    def load(self) -> None:
-        """Make what the first identification would have to wait for."""
-        _brightest(self.catalogue, self.triangles)
-        _touch(self.triangles)
-
-    @property
     def years(self) -> float:
         """Julian years since the catalogue's epoch."""
         return self.year - EPOCH
@@ -60,7 +52,7 @@ class Sky:
 
 
 @lru_cache(maxsize=4)
-def _undated(catalogue: Catalogue, triangles: TriangleCatalogue) -> Sky:
+def _undated(catalogue: Catalogue, triangles: TriangleCatalogue | None) -> Sky:
     return Sky(catalogue, triangles)
 
 
@@ -70,13 +62,7 @@ def _stars(catalogue: Catalogue) -> StarTable:
 
 
 @lru_cache(maxsize=4)
-def _brightest(catalogue: Catalogue, triangles: TriangleCatalogue) -> BrightTable:
-    return BrightTable(_stars(catalogue), triangles.star, triangles.rank, triangles.cell_start)
-
-
-@lru_cache(maxsize=4)
-def _touch(triangles: TriangleCatalogue) -> None:
+def touch(triangles: TriangleCatalogue) -> None:
     """Read a number of each page of the mapped table: a page that is new to the process takes longer than a look-up."""
-    _ = triangles.compiled
     triangles.shape.ravel()[:: PAGE_BYTES // triangles.shape.itemsize].max(initial=0)
     triangles.counter_clockwise[::PAGE_BYTES].any()

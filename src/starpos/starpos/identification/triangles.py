@@ -100,23 +100,6 @@ class TriangleCatalogue:
         return TriangleTable(self, CROWDED, SCALE_TOLERANCE, TRIANGLE_SIGMA)
 
 
-def no_triangles() -> TriangleCatalogue:
-    """A TriangleCatalogue without any, for a sky whose field is not known beforehand."""
-    none, bins = np.zeros(0, np.int32), int(np.prod(BINS))
-    return TriangleCatalogue(
-        star=none,
-        cell_start=np.zeros(ZONES * CELLS + 1, np.int32),
-        rank=none,
-        beacon=none,
-        beacons=np.zeros((0, 3)),
-        corners=np.zeros((0, 3), np.int32),
-        counter_clockwise=np.zeros(0, bool),
-        shape=np.zeros((0, 3), np.uint16),
-        longest_allowed=np.ones(1),
-        bin_start=np.zeros(bins + 1, np.int8),
-    )
-
-
 def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet) -> TriangleCatalogue:
     """Triangles for a field of this half diagonal (rad), of the brightest stars of every circle over the sky.
 

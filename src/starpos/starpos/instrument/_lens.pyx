@@ -71,6 +71,8 @@ cdef class PlumbBob(Lens):
     leads where the distortion cannot be inverted.
     """
 
+    cdef bint bent
+
     def __init__(self, d):
         super().__init__(d)
         self.bent = any(d)
@@ -157,6 +159,9 @@ cdef class Equidistant(Lens):
     lens has a picture. With p1, p2 its glasses are not on one axis: as in COLMAP's THIN_PRISM_FISHEYE each place is moved
     by 2 p1 x y + p2 (theta^2 + 2 x^2) and p1 (theta^2 + 2 y^2) + 2 p2 x y, where x, y are theta along the two axes.
     """
+
+    cdef readonly double reach
+    cdef bint centred
 
     def __init__(self, d, double reach):
         super().__init__(d)

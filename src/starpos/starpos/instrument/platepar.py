@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import erfa
 import numpy as np
 
 from starpos import files, rotation
@@ -19,7 +20,7 @@ from starpos.errors import InstrumentError
 from starpos.frames.fits import rms_config
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.instrument import Instrument
-from starpos.units import DAY_S
+from starpos.units import DAY_S, UNIX_EPOCH_JD
 
 # a platepar lists the stars of its fit
 MAX_BYTES = 4_000_000
@@ -27,7 +28,6 @@ MAX_BYTES = 4_000_000
 SIDE, FURTHEST = 41, np.radians(95)
 # odd powers of r after the first, and the distortion type that has these four
 POWERS, ODD_TERMS = (3, 5, 7, 9), "radial9-odd"
-UNIX_EPOCH_JD, J2000_JD, CENTURY_D = 2440587.5, 2451545.0, 36525.0
 # rounds in which the pointing is found, and what is left of it at the end, rad
 ROUNDS, SETTLED = 50, 1e-10
 
@@ -180,7 +180,7 @@ class SkyPixels:
     height_m: float
 
 
-def platepar_of(camera: Camera, seen: SkyPixels, station: str = "XX0001") -> tuple[dict[str, Any], float]:
+def platepar_of(camera: Camera, seen: SkyPixels) -> tuple[dict[str, Any], float]:
     """The content of a platepar, and by how many px at most RMS then sees a direction elsewhere than the camera.
 
     Its photometry is not calibrated: RMS's defaults.  InstrumentError for a camera that looks at a celestial pole.
@@ -190,19 +190,19 @@ def platepar_of(camera: Camera, seen: SkyPixels, station: str = "XX0001") -> tup
     rays = camera.directions(*seen.xy.T)
     apparent = _refracted(seen.icrs, jd, *site)
     to_sky = rotation.best_rotation(rays, apparent)
-    ra, dec = _angles(to_sky[:, 2])
+    ra, dec = erfa.c2s(to_sky[:, 2])
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     right, north = to_sky[:, 0], np.cross(to_sky[:, 2], east)
     seen_at = np.array([ra, dec, np.arctan2(right @ north, -right @ east)])
     pointing = _reference(seen_at, jd, *site)
     plate = _lens_terms(camera) | {
         "version": 2,
-        "station_code": station,
+        "station_code": "XX0001",
         "lat": float(np.degrees(seen.latitude)),
         "lon": float(np.degrees(seen.longitude)),
         "elev": float(seen.height_m),
         "JD": jd,
-        "Ho": _sidereal_deg(jd),
+        "Ho": float(np.degrees(_sidereal(jd))),
         "UT_corr": 0,
         "refraction": True,
         "measurement_apparent_to_true_refraction": False,
@@ -218,7 +218,7 @@ def platepar_of(camera: Camera, seen: SkyPixels, station: str = "XX0001") -> tup
         "auto_recalibrated": False,
     }
     plate |= dict(zip(("RA_d", "dec_d", "pos_angle_ref"), np.degrees(pointing).tolist(), strict=True))
-    east, north, up = _horizon(jd, *site) @ _precession(J2000_JD, jd) @ rotation.unit_vector(*pointing[:2])
+    east, north, up = _horizon(jd, *site) @ _precession(erfa.DJ00, jd) @ rotation.unit_vector(*pointing[:2])
     plate["az_centre"] = float(np.degrees(np.arctan2(east, north)) % 360)
     plate["alt_centre"] = float(np.degrees(_raised(np.arcsin(up))))
     off = _distorted(plate, apparent @ to_sky) - seen.xy
@@ -281,29 +281,20 @@ def _distorted(plate: Mapping[str, Any], rays: np.ndarray) -> np.ndarray:
 # RMS's sky, after Meeus; RMS computes it in Astrometry/CyFunctions
 
 
-def _sidereal_deg(jd: float) -> float:
-    """Mean sidereal time in Greenwich."""
-    days = jd - J2000_JD
-    t = days / CENTURY_D
-    return float((280.46061837 + 360.98564736629 * days + 0.000387933 * t**2 - t**3 / 38710000) % 360)
+def _sidereal(jd: float) -> float:
+    """Mean sidereal time in Greenwich, rad."""
+    return float(erfa.gmst82(jd, 0.0))
 
 
 def _precession(start_jd: float, end_jd: float) -> np.ndarray:
     """Rotation (3, 3) of mean equatorial axes from one date to another (IAU 1976)."""
-    T, t = (start_jd - J2000_JD) / CENTURY_D, (end_jd - start_jd) / CENTURY_D
-    linear = 2306.2181 + 1.39656 * T - 0.000139 * T**2
-    zeta = linear * t + (0.30188 - 0.000344 * T) * t**2 + 0.017998 * t**3
-    z = linear * t + (1.09468 + 0.000066 * T) * t**2 + 0.018203 * t**3
-    theta = (
-        (2004.3109 - 0.85330 * T - 0.000217 * T**2) * t - (0.42665 + 0.000217 * T) * t**2 - 0.041833 * t**3
-    )
-    zeta, z, theta = np.radians(np.array([zeta, z, theta]) / 3600)
+    zeta, z, theta = erfa.prec76(start_jd, 0.0, end_jd, 0.0)
     return rotation.about_axis(2, z) @ rotation.about_axis(1, -theta) @ rotation.about_axis(2, zeta)
 
 
 def _nutation(jd: float) -> np.ndarray:
     """The rotation (3, 3) by which RMS nutates a pointing."""
-    t = (jd - J2000_JD) / CENTURY_D
+    t = (jd - erfa.DJ00) / erfa.DJC
     node, sun, moon = np.radians(
         [125.04452 - 1934.136261 * t, 280.4665 + 36000.7698 * t, 218.3165 + 481267.8813 * t]
     )
@@ -315,9 +306,8 @@ def _nutation(jd: float) -> np.ndarray:
 
 def _horizon(jd: float, latitude: float, longitude: float) -> np.ndarray:
     """Rotation (3, 3) of equatorial axes of date into east, north, up."""
-    time = np.radians(_sidereal_deg(jd)) + longitude
-    up = rotation.unit_vector(time, latitude)
-    east = np.array([-np.sin(time), np.cos(time), 0.0])
+    time = _sidereal(jd) + longitude
+    up, east = rotation.unit_vector(time, latitude), np.array([-np.sin(time), np.cos(time), 0.0])
     return np.stack([east, np.cross(up, east), up])
 
 
@@ -329,24 +319,19 @@ def _raised(altitude: np.ndarray) -> np.ndarray:
 
 def _refracted(v: np.ndarray, jd: float, latitude: float, longitude: float) -> np.ndarray:
     """J2000 directions (N, 3) as refraction raises them, still along the axes of J2000."""
-    of_date, to_local = _precession(J2000_JD, jd), _horizon(jd, latitude, longitude)
+    of_date, to_local = _precession(erfa.DJ00, jd), _horizon(jd, latitude, longitude)
     local = v @ (to_local @ of_date).T
     raised = _raised(np.arcsin(np.clip(local[:, 2], -1, 1)))
     across = local[:, :2] / np.maximum(np.hypot(local[:, 0], local[:, 1]), 1e-12)[:, None]
     lifted = np.column_stack([across * np.cos(raised)[:, None], np.sin(raised)])
-    return lifted @ to_local @ _precession(jd, J2000_JD).T
-
-
-def _angles(v: np.ndarray) -> tuple[float, float]:
-    """Right ascension and declination of a direction (3,), rad."""
-    return float(np.arctan2(v[1], v[0]) % (2 * np.pi)), float(np.arctan2(v[2], np.hypot(v[0], v[1])))
+    return lifted @ to_local @ _precession(jd, erfa.DJ00).T
 
 
 def _seen_pointing(reference: np.ndarray, jd: float, latitude: float, longitude: float) -> np.ndarray:
     """The right ascension, declination, position angle (3,) with which RMS works, for `reference` in a platepar."""
     ra, dec, angle = reference
     before = _refracted(rotation.unit_vector(ra, dec)[None], jd, latitude, longitude)[0]
-    turn = _precession(jd, J2000_JD)
+    turn = _precession(jd, erfa.DJ00)
     after = _nutation(jd) @ turn @ before
     normal = np.cross(before, after)
 
@@ -356,7 +341,7 @@ def _seen_pointing(reference: np.ndarray, jd: float, latitude: float, longitude:
         return float(np.arctan2(np.cross(normal, parallel) @ axis, normal @ parallel))
 
     change = along_parallel(turn @ normal, after) - along_parallel(normal, before)
-    return np.array([*_angles(after), angle + change])
+    return np.array([*erfa.c2s(after), angle + change])
 
 
 def _reference(seen: np.ndarray, jd: float, latitude: float, longitude: float) -> np.ndarray:

@@ -9,7 +9,6 @@ eraPlan94, the largest differences from DE200 over 1800 to 2050.
 import io
 import struct
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any, Protocol
 
 import erfa
@@ -101,19 +100,9 @@ class ErfaEphemeris:
 
 ERFA = ErfaEphemeris()
 # NAIF's numbers; of the outer planets the barycentres with their moons, from which they are off by less than 0.1 arcsec
-NAIF = MappingProxyType(
-    {
-        SUN: 10,
-        MOON: 301,
-        "mercury": 199,
-        "venus": 299,
-        "mars": 4,
-        "jupiter": 5,
-        "saturn": 6,
-        "uranus": 7,
-        "neptune": 8,
-    }
-)
+NAIF = {SUN: 10, MOON: 301} | {
+    name: number if number > 3 else 100 * number + 99 for name, (number, *_) in PLANETS.items()
+}
 EARTH, BARYCENTRE, KERNEL_ARCSEC = 399, 0, 0.1
 # de440.bsp, the largest one that is usual, has 120 MB
 MAX_BYTES = 200_000_000

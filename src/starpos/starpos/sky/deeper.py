@@ -2,7 +2,6 @@
 """How deep a catalogue a field needs, and a deeper one for small fields: all of Tycho-2, kept in the cache."""
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -20,45 +19,12 @@ SPARSE_TO_V11, TIMES_A_MAG = 10.0, 2.2
 FAINTEST_SHARE = 0.01
 
 
-@dataclass(frozen=True, kw_only=True)
-class Depth:
-    """How many stars of a catalogue a field holds.
-
-    width_deg, height_deg  of the field
-    limit_mag              V to which the catalogue goes
-    mean, sparse           stars on a frame: on average, and in the tenth of the sky with the fewest
-    needed_mag             V to which a catalogue for the field should go, to half a magnitude
-    """
-
-    width_deg: float
-    height_deg: float
-    limit_mag: float
-    mean: float
-    sparse: float
-    needed_mag: float
-
-    @classmethod
-    @lru_cache(maxsize=16)
-    def of(cls, camera: Camera, catalogue: Catalogue) -> "Depth":
-        """The Depth of a catalogue for a camera's field."""
-        size = camera.width / camera.fx, camera.height / camera.fy
-        width_deg, height_deg = (math.degrees(2 * math.atan(s / 2)) for s in size)
-        limit_mag, mean, sparse = _densities(catalogue)
-        area_deg2 = _solid_angle_deg2(*size)
-        more = math.log(ENOUGH_ON_FRAME / (SPARSE_TO_V11 * area_deg2)) / math.log(TIMES_A_MAG)
-        return cls(
-            width_deg=width_deg,
-            height_deg=height_deg,
-            limit_mag=limit_mag,
-            mean=mean * area_deg2,
-            sparse=sparse * area_deg2,
-            needed_mag=math.ceil(2 * (11 + more)) / 2,
-        )
-
-    @property
-    def enough(self) -> bool:
-        """Whether nearly all frames of the field hold enough stars."""
-        return self.sparse >= ENOUGH_ON_FRAME
+@lru_cache(maxsize=16)
+def stars_on_frame(camera: Camera, catalogue: Catalogue) -> tuple[float, float]:
+    """Stars of a catalogue on a camera's frame: on average, and in the tenth of the sky with the fewest."""
+    _, mean, sparse = _densities(catalogue)
+    area_deg2 = _solid_angle_deg2(camera)
+    return mean * area_deg2, sparse * area_deg2
 
 
 @lru_cache(maxsize=4)
@@ -79,8 +45,9 @@ def _densities(catalogue: Catalogue) -> tuple[float, float, float]:
     return float(faint), float(len(catalogue) / area.sum()), float(sparse)
 
 
-def _solid_angle_deg2(width: float, height: float) -> float:
-    """Solid angle of a pinhole's frame of this size in focal lengths."""
+def _solid_angle_deg2(camera: Camera) -> float:
+    """Solid angle of a pinhole's frame."""
+    width, height = camera.width / camera.fx, camera.height / camera.fy
     u, v = (np.arange(-20, 21) / 20 * n / 2 for n in (width, height))
     # a pixel's solid angle falls with the cube of the cosine
     share = np.mean((1 + u[:, None] ** 2 + v**2) ** -1.5)
@@ -95,7 +62,7 @@ KEPT = kept_catalogues("stars of the deeper catalogue")
 
 def for_field(catalogue: Catalogue, camera: Camera) -> Catalogue:
     """The catalogue, or the deeper one in the cache if a camera's field holds too few of its stars."""
-    if Depth.of(camera, catalogue).enough:
+    if stars_on_frame(camera, catalogue)[1] >= ENOUGH_ON_FRAME:
         return catalogue
     deeper = kept()
     return catalogue if deeper is None or len(deeper) <= len(catalogue) else deeper
@@ -103,16 +70,21 @@ def for_field(catalogue: Catalogue, camera: Camera) -> Catalogue:
 
 def too_thin(catalogue: Catalogue, camera: Camera) -> str:
     """Sentence on how few catalogue stars a camera's field holds, what it needs and how to get it; '' if enough."""
-    depth = Depth.of(camera, catalogue)
-    if depth.enough:
+    mean, sparse = stars_on_frame(camera, catalogue)
+    if sparse >= ENOUGH_ON_FRAME:
         return ""
+    sides = camera.width / camera.fx, camera.height / camera.fy
+    width_deg, height_deg = (math.degrees(2 * math.atan(side / 2)) for side in sides)
+    more = math.log(ENOUGH_ON_FRAME / (SPARSE_TO_V11 * _solid_angle_deg2(camera))) / math.log(TIMES_A_MAG)
+    # to half a magnitude
+    needed_mag = math.ceil(2 * (11 + more)) / 2
     holds = (
-        f"a field of {depth.width_deg:.2g} x {depth.height_deg:.2g} deg holds only {depth.mean:.1f} stars of the "
-        f"catalogue (V < {depth.limit_mag:.1f}) on average and needs one to V = {depth.needed_mag:.1f}"
+        f"a field of {width_deg:.2g} x {height_deg:.2g} deg holds only {mean:.1f} stars of the catalogue "
+        f"(V < {_densities(catalogue)[0]:.1f}) on average and needs one to V = {needed_mag:.1f}"
     )
     if len(catalogue) >= TYCHO2_STARS or kept() is not None:
         return f"{holds}, deeper than Tycho-2: name one in STARPOS_CATALOGUE, or take a wider field"
-    more = depth.mean * TYCHO2_STARS / max(len(catalogue), 1)
+    more = mean * TYCHO2_STARS / max(len(catalogue), 1)
     return (
         f"{holds}; all of Tycho-2 would be {more:.0f}: "
         "build it (docs/how-to/small_fields.md) and type `starpos catalogue deepen FILE`"

@@ -171,7 +171,7 @@ def with_gaia(base: Catalogue, extract: Extract, year: float) -> tuple[Catalogue
     parallax = base.parallax_mas()
     sigma, sigma_pm = _errors(base)
     epoch = EPOCH_ZERO + base.epoch_code.astype(float)
-    gaia = _rows(extract, star)
+    gaia = replace(extract, **{name: column[star] for name, column in vars(extract).items()})
     there_ra, there_dec = gaia.at(year)
     pm_ra[row], pm_dec[row], parallax[row] = gaia.pm_ra, gaia.pm_dec, gaia.parallax_mas
     back = (EPOCH - year) * MAS_DEG
@@ -194,10 +194,6 @@ def _errors(base: Catalogue) -> tuple[np.ndarray, np.ndarray]:
     """
     step = CODE_STEP ** np.array([base.sigma_code, base.pm_sigma_code], float) * (1 - 1e-6)
     return SMALLEST_MAS * step[0], SMALLEST_MAS_YEAR * step[1]
-
-
-def _rows(extract: Extract, rows: np.ndarray) -> Extract:
-    return replace(extract, **{name: column[rows] for name, column in vars(extract).items()})
 
 
 def _matched(base: Catalogue, extract: Extract) -> tuple[np.ndarray, np.ndarray]:

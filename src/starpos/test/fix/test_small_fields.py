@@ -12,7 +12,6 @@ from starpos.instrument.instrument import Instrument
 from starpos.rotation import normalised
 from starpos.sky import deeper
 from starpos.sky.catalogue import pack
-from starpos.sky.deeper import Depth
 
 pytestmark = pytest.mark.montecarlo
 
@@ -87,7 +86,7 @@ def off_px(s, middle, camera):
 
 @pytest.mark.parametrize("focal_error", [0.0, 0.02, -0.02])
 def test_a_field_that_the_catalogue_is_too_thin_for_is_found_with_the_deeper_one(focal_error, sky, thin, rng):
-    assert not Depth.of(CAMERA, thin).enough
+    assert deeper.too_thin(thin, CAMERA)
     solver = Solver(Instrument(CAMERA.fx * (1 + focal_error)), thin)
     found = 0
     for _ in range(12):

@@ -19,7 +19,6 @@ from starpos.frames.reading import read_frame
 from starpos.identification import Sky, blind, quads
 from starpos.identification.pose import stars_at
 from starpos.identification.quads import matches
-from starpos.identification.triangles import no_triangles
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 
@@ -169,7 +168,7 @@ def test_building_the_quads_takes_no_time_of_the_search(solver, catalogue, rng, 
 def test_at_any_scale_the_quads_of_a_frame_are_those_of_the_sky(catalogue, rng):
     """Every quad of the sky that a frame can hold is found again, whatever the focal length of that frame."""
     sky, table, half_px = (
-        Sky(catalogue, no_triangles()),
+        Sky(catalogue, None),
         quads.cached_quads(catalogue),
         np.hypot(WIDTH, HEIGHT) / 2,
     )

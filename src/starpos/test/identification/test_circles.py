@@ -66,31 +66,3 @@ def test_triangles_of_millions_of_stars_are_those_of_their_triples(stars, triple
     np.testing.assert_allclose(
         (shape[:, 2] + 0.5) * (0.1 / 65536), opposite_sides(stars[corners]).max(1), atol=1e-6
     )
-
-
-@pytest.mark.parametrize(
-    ("first", "others", "sentence"),
-    [
-        ([0, 1, 1, 0], [1 << 32 | 2], "do not follow"),
-        ([0, 2, 1, 1], [1 << 32 | 2], "do not follow"),
-        ([0, 1, 1, 1], [1 << 32 | 3], "make no triple"),
-        ([0, 1, 1, 1], [2 << 32 | 1], "make no triple"),
-        ([0, 1, 1, 1], [-1], "make no triple"),
-    ],
-)
-def test_triples_that_are_out_of_order_or_of_no_star_are_refused(first, others, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        binned(
-            np.eye(3),
-            np.arange(3, dtype=np.int32),
-            np.array(first),
-            np.array(others),
-            0.1,
-            3.0,
-            int(np.prod(BINS)),
-        )
-
-
-def test_triples_of_a_star_beyond_all_are_refused():
-    with pytest.raises(ValueError, match="not of the 3 stars"):
-        distinct(np.array([3], np.int32), np.array([4 << 32 | 5]), 3)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The evidence for an identification: no larger by chance than it says, and as large as the stars allow."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from crowds import identified
@@ -148,16 +150,16 @@ def test_the_priors_share_half_of_the_probability(catalogue, rng, monkeypatch):
     tried = {}
 
     def judge(*known):
-        tried[id(known[4])] = known[4]
-        return judged(*known)
+        tried[id(known[3])] = known[3]
+        return finder.judge(*known)
 
     def anywhere(focal_px, log_share):
         prior = lost(focal_px, log_share)
         tried[id(prior)] = prior
         return prior
 
-    judged, lost = full.Judge, search.anywhere
-    monkeypatch.setattr(full, "Judge", judge)
+    finder, lost = full.finder_of(sky.catalogue, sky.triangles), search.anywhere
+    monkeypatch.setattr(full, "finder_of", lambda *_: SimpleNamespace(judge=judge))
     monkeypatch.setattr(search, "anywhere", anywhere)
     assert not list(search.near_or_lost(field, sky, priors, search.STAGES))
     *led, unled = (np.exp(prior.log_density(expected)) * prior.width.prod() for prior in tried.values())
@@ -233,7 +235,7 @@ def test_what_lies_beyond_the_frame_does_not_make_chance_rarer(rng):
     xy = rng.uniform(0, [299, 224], (20, 2))
     # As a lens that draws in does.
     xy[3] = -40.0, 100.0
-    field = search.frame_stars(SMALL.directions(*xy.T), np.full(20, SIGMA_PX), SMALL)
+    field = stars_at(SMALL, SMALL.directions(*xy.T), np.full(20, SIGMA_PX))
     assert (field.half > [150, 112.5]).all()
     assert field.area_px2 == AREA_PX2
 

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from starpos.identification import Identification, search
-from starpos.identification._frame import FrameStars
+from starpos.identification.pose import stars_at
+from starpos.instrument.camera import Camera
 
+CAMERA = Camera.from_focal(100, 80, 1e3)
 VALUES = {
     "star": [0, 2, 5],
     "catalogue": [700, 30, 41],
@@ -21,10 +23,6 @@ VALUES = {
     "expected": [30, 41, 700, 12],
     "mirrored": True,
 }
-
-
-def frame(xy, sigma):
-    return FrameStars(xy=xy, sigma=sigma, middle=(0, 0), half=(50, 40), focal_px=1e3, area_px2=8e3, tested=50)
 
 
 def same(found, values):
@@ -59,26 +57,27 @@ def test_arrays_of_an_identification_that_do_not_fit_are_refused(wrong, sentence
 
 
 def test_the_stars_of_a_frame_are_what_was_given_and_a_copy():
-    xy, sigma = np.arange(12.0).reshape(2, 3, 2), np.array([0.1, 0.2, 0.3])
-    stars = frame(xy.copy(), sigma.copy())
+    given, sigma = np.arange(6.0).reshape(3, 2), np.array([0.1, 0.2, 0.3])
+    stars = stars_at(CAMERA, given.copy(), sigma.copy())
     taken = stars.of_rows(np.array([2, 0]))
     assert len(stars) == 3
     assert len(taken) == 2
-    assert np.array_equal(stars.xy, xy)
+    from_axis = given - [49.5, 39.5]
+    np.testing.assert_allclose(stars.xy, [from_axis, from_axis * [1, -1]])
     assert np.array_equal(stars.sigma, sigma)
-    assert np.array_equal(taken.xy, xy[:, [2, 0]])
+    assert np.array_equal(taken.xy, stars.xy[:, [2, 0]])
     assert np.array_equal(taken.sigma, sigma[[2, 0]])
-    assert np.array_equal(stars.but(tested=5).xy, xy)
+    assert np.array_equal(stars.but(tested=5).xy, stars.xy)
 
 
-@pytest.mark.parametrize("shape", [(2, 3, 2), (2, 4, 3), (1, 4, 2), (4, 2)])
-def test_pixels_that_are_not_those_of_the_errors_are_refused(shape):
-    with pytest.raises(ValueError, match="4 errors for pixels of shape"):
-        frame(np.zeros(shape), np.ones(4))
+@pytest.mark.parametrize("seen", [np.zeros((3, 2)), np.full((4, 2), np.nan), -np.eye(4)[:, :3]])
+def test_what_is_no_place_of_a_star_on_a_frame_is_refused(seen):
+    with pytest.raises(ValueError, match="finite pixels and errors"):
+        stars_at(CAMERA, seen, np.ones(4))
 
 
 def test_a_search_of_no_stage_or_of_too_many_is_refused(sky):
-    stars = frame(np.zeros((2, 5, 2)), np.ones(5))
+    stars = stars_at(CAMERA, np.zeros((5, 2)), np.ones(5))
     for stages in ([], [(5, 0.3)] * 9):
         with pytest.raises(ValueError, match=f"^{len(stages)} stages"):
             next(search.near_or_lost(stars, sky, (), stages))

@@ -13,7 +13,8 @@ from starpos.fix.solution import TWO_SKIES, Status
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame, Stars
 from starpos.identification.evidence import explained_by
-from starpos.identification.search import frame_stars, identify
+from starpos.identification.pose import stars_at
+from starpos.identification.search import identify
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
@@ -67,7 +68,7 @@ def warns(light: Light, catalogue, rng) -> bool:
     on = np.flatnonzero(on)[np.argsort(mag[on])]
     xy, flux = light.xy[on] + rng.normal(0, SIGMA_PX, (len(on), 2)), 10 ** (-0.4 * mag[on])
     v, sigma, sky = CAMERA.directions(*xy.T), np.full(len(on), SIGMA_PX), sky_for(catalogue, CAMERA)
-    seen = frame_stars(v, sigma, CAMERA)
+    seen = stars_at(CAMERA, v, sigma)
     found = identify(seen, sky)
     assert found is not None
     return two_skies(seen, flux, sky, found, explained_by(found, seen))

@@ -9,24 +9,20 @@ export class Link {
   constructor(handlers) {
     this.handlers = handlers;
     this.heardAt = -Infinity;
-    this.frames = null;
   }
 
   get alive() {
     return performance.now() - this.heardAt < SILENT_MS;
   }
 
-  // Whether frames are wanted: without a page that shows them the detector draws none.
-  open(frames) {
-    if (frames === this.frames) return;
-    this.frames = frames;
-    this._connect();
-  }
-
-  _connect() {
+  close() {
     clearTimeout(this.timer);
     this.source?.close();
-    const source = new EventSource(this.frames ? "/events?frame" : "/events");
+  }
+
+  open() {
+    this.close();
+    const source = new EventSource("/events");
     this.source = source;
     source.addEventListener("state", (event) => {
       this.heardAt = performance.now();
@@ -37,7 +33,7 @@ export class Link {
     source.addEventListener("error", () => {
       if (source.readyState !== EventSource.CLOSED) return; // the browser comes again by itself
       clearTimeout(this.timer);
-      this.timer = setTimeout(() => this._connect(), AGAIN_MS);
+      this.timer = setTimeout(() => this.open(), AGAIN_MS);
     });
   }
 }

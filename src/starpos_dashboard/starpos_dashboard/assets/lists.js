@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The lights of the links, and the bars of the error budget.
 
-import { add, element, rows } from "/page.js";
+import { add, element, rows, write } from "/page.js";
 import * as text from "/text.js";
 
 const LEVELS = ["ok", "warn", "error", "stale"];
@@ -13,9 +13,9 @@ export function showLights(list, lights, limit) {
     const silent = !(light.age < limit);
     item.className = silent ? "silent" : LEVELS[light.level];
     const [, name, sentence, level] = item.children;
-    set(name, light.name);
-    set(level, silent ? "SILENT" : WORDS[light.level]);
-    set(sentence, silent ? `nothing heard for ${text.age(light.age)}` : light.sentence);
+    write(name, light.name);
+    write(level, silent ? "SILENT" : WORDS[light.level]);
+    write(sentence, silent ? `nothing heard for ${text.age(light.age)}` : light.sentence);
   });
 }
 
@@ -36,10 +36,10 @@ export function showBudget(terms) {
   rows(element("budget"), shown, makeBar, (item, term) => {
     const [name, bar, metres, heading] = item.children;
     item.className = term.common ? "common" : "random";
-    set(name, term.name);
+    write(name, term.name);
     bar.firstElementChild.style.width = `${(100 * term.position) / most}%`;
-    set(metres, text.metres(term.position));
-    set(heading, text.angle(term.heading));
+    write(metres, text.metres(term.position));
+    write(heading, text.angle(term.heading));
   });
 }
 
@@ -55,8 +55,4 @@ function makeBar(parent) {
   add(add(item, "span", { class: "bar", "aria-hidden": "true" }), "i");
   add(item, "span", { class: "metres numbers" });
   add(item, "span", { class: "turn numbers" });
-}
-
-function set(e, said) {
-  if (e.textContent !== said) e.textContent = said;
 }

@@ -199,10 +199,9 @@ function showErrors() {
 
 const picture = element("frame");
 let frameNumber = 0;
-let wanted = localStorage.getItem("frame") !== "hidden";
 
 function showFrame() {
-  const number = state.frame && !state.frame.trouble && wanted ? state.frame.number : 0;
+  const number = state.frame && !state.frame.trouble ? state.frame.number : 0;
   if (!number) {
     frameNumber = 0;
     picture.hidden = true;
@@ -218,24 +217,15 @@ picture.addEventListener("error", () => (picture.hidden = true));
 
 function dressFrame() {
   const { frame } = state;
-  if (wanted) dressByAge("frame", frame, "");
-  else dress("frame", "", "");
-  const waiting = "no frame yet: the detector draws the next one";
-  say("frame-note", !wanted ? "hidden: the detector draws none for this page" : frame ? frame.trouble : waiting);
+  dressByAge("frame", frame, "");
+  say("frame-note", frame ? frame.trouble : "no frame yet: the detector draws the next one");
 }
 
+// A page that nobody sees hears nothing, and the detector draws no frame for it.
 function look() {
-  link.open(wanted && !document.hidden);
+  if (document.hidden) link.close();
+  else link.open();
 }
-
-element("frame-switch").addEventListener("click", () => {
-  wanted = !wanted;
-  localStorage.setItem("frame", wanted ? "shown" : "hidden");
-  dressSwitches();
-  showFrame();
-  render();
-  look();
-});
 
 // night ---------------------------------------------------------------------------------------------------------------
 
@@ -244,19 +234,17 @@ let night = localStorage.getItem("night") === "on";
 element("night").addEventListener("click", () => {
   night = !night;
   localStorage.setItem("night", night ? "on" : "off");
-  dressSwitches();
+  dressNight();
 });
 
-function dressSwitches() {
+function dressNight() {
   document.documentElement.classList.toggle("night", night);
   element("night").setAttribute("aria-pressed", night);
-  element("frame-switch").setAttribute("aria-pressed", wanted);
-  say("frame-switch", wanted ? "Shown" : "Hidden");
 }
 
 // the beginning -------------------------------------------------------------------------------------------------------
 
-dressSwitches();
+dressNight();
 render();
 document.addEventListener("visibilitychange", look);
 look();

@@ -5,10 +5,11 @@ const SVG = "http://www.w3.org/2000/svg";
 
 export const element = (id) => document.getElementById(id);
 
-export function say(id, text) {
-  const e = element(id);
+export function write(e, text) {
   if (e.textContent !== text) e.textContent = text;
 }
+
+export const say = (id, text) => write(element(id), text);
 
 export function add(parent, name, attributes = {}, text = "") {
   const e = document.createElementNS(parent.namespaceURI === SVG || name === "svg" ? SVG : parent.namespaceURI, name);
