@@ -231,19 +231,11 @@ def _evened(mesh: np.ndarray, steep: float, goes_on: bool) -> np.ndarray:
     goes_on  whether a gradient goes on beyond the edge; else it ends there
     """
     base = mesh.mean()
-    typical = cv2.medianBlur(_continued((mesh - base).astype(np.float32), 2), 3)
+    around = np.pad(mesh - base, 2, "reflect", reflect_type="odd").astype(np.float32)
+    typical = cv2.medianBlur(around, 3)
     mean = cv2.blur(typical, (3, 3))
     even = np.where(np.abs(mean - typical) < steep, mean, typical)[2:-2, 2:-2] + base
-    return _continued(even, 1) if goes_on else cv2.copyMakeBorder(even, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-
-
-def _continued(mesh: np.ndarray, cells: int) -> np.ndarray:
-    """A mesh with so many more cells beyond each edge, in which its gradient goes on."""
-    level, back = (
-        cv2.copyMakeBorder(mesh, cells, cells, cells, cells, border)
-        for border in (cv2.BORDER_REPLICATE, cv2.BORDER_REFLECT_101)
-    )
-    return 2 * level - back
+    return np.pad(even, 1, "reflect", reflect_type="odd") if goes_on else np.pad(even, 1, "edge")
 
 
 def between(mesh: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
