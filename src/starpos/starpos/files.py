@@ -10,8 +10,9 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 from urllib.parse import unquote, urlsplit
 
 from starpos.errors import InstrumentError, StarposError, WriteError
@@ -22,6 +23,17 @@ LONGEST_PATH = 4096
 AT_ONCE = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
 # every page and picture that starpos makes has this mark in its first HEAD bytes
 MARK, HEAD = b"starpos", 400
+
+
+@cache
+def rows_of(file: Path) -> dict[str, Any]:
+    """The rows of a YAML file of a package."""
+    import yaml
+
+    # PyYAML's parser in C takes a tenth of the time; a build without it is rare
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    rows: dict[str, Any] = yaml.load(file.read_bytes(), loader)
+    return rows
 
 
 def open_regular(path: Path | str) -> BinaryIO:

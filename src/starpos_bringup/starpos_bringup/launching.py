@@ -15,7 +15,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.substitutions import FindPackageShare
 
-from starpos.parameters.table import rows_of
+from starpos.files import rows_of
 from starpos_bringup.launch_arguments import LaunchError, is_true, names, one_of
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from starpos.cli.commands import Command
 from starpos.errors import BagError
-from starpos.parameters.table import rows_of
+from starpos.files import rows_of
 from starpos_bringup.bag import BagWriter
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from starpos.cli import console, inputs, options, overwriting
 from starpos.cli.commands import DATA
 from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, InstrumentError
-from starpos.files import save
+from starpos.files import rows_of, save
 from starpos.fix.attitude import Attitude
 from starpos.fix.directions import horizontal, towards
 from starpos.fix.heading import AttitudeAtPlace
@@ -23,7 +23,6 @@ from starpos.fix.searching import Sight
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import Camera
 from starpos.night import horizon
-from starpos.parameters.table import rows_of
 from starpos.tables import TableForm
 from starpos.units import utc_text
 

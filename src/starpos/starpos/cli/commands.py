@@ -10,7 +10,7 @@ from typing import Any
 
 from starpos.cli import COMMANDS
 from starpos.errors import StarposError
-from starpos.parameters.table import rows_of
+from starpos.files import rows_of
 
 DATA = Path(__file__).with_name("data")
 

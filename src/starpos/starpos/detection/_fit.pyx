@@ -98,7 +98,7 @@ cdef struct Star:
 
 cdef struct Solution:
     # Of all unknowns, star after star: normal equations, then their scaled factor; the right side, the covariance, the last
-    # step; the normal equations without the gains. Sigma of each flux at known gains.
+    # step; the normal equations without the gains. Sigma of each flux at known gains; SNR of each star in the sky's noise.
     bint solved
     int unknowns
     double[LARGEST * LARGEST] normal
@@ -108,6 +108,7 @@ cdef struct Solution:
     double[LARGEST * LARGEST] covariance
     double[36] known
     double[STARS] sigma
+    double[STARS] snr
 
 
 cdef struct Stamp:
@@ -475,16 +476,17 @@ cdef void _set_leverages(const Stamp *s, const Star *star, Rules rules, const So
 
 
 cdef double _set_images(
-    const Stamp *s, const Star *star, bint solved, const Pixels *p, float *model, int apart, float *residual, unsigned char *used,
-    unsigned char *outlier, double *pixels,
+    const Stamp *s, const Star *star, Solution *to, const Pixels *p, float *model, int apart, float *residual, unsigned char *used,
+    unsigned char *outlier, double *pixels, double *foreign,
 ) noexcept nogil:
-    """Set the models, `apart` numbers from star to star, the residual and the marks of each pixel, and how many were fitted.
+    """Set the models, `apart` numbers from star to star, the residual and the marks of each pixel, how many were fitted, and sums.
 
     Returns chi-square per degree of freedom.
     """
     cdef int j, k, place, count = 0, area = s.size * s.size
-    pixels[0] = 0.0
-    if not solved:
+    cdef double light
+    pixels[0] = foreign[0] = to.snr[0] = to.snr[1] = 0.0
+    if not to.solved:
         for j in range(area):
             residual[j] = NAN
             for k in range(p.stars):
@@ -504,6 +506,13 @@ cdef double _set_images(
         place = p.place[j]
         used[place], outlier[place] = p.weight[j] > 0, p.outlier[place]
         count += used[place]
+        if outlier[place] and p.residual[j] > 0:
+            foreign[0] += p.residual[j]
+    for k in range(p.stars):
+        for j in range(p.count):
+            light = star[k].flux * p.of[k].value[j] if p.weight[j] > 0 else 0.0
+            to.snr[k] += light * light / p.noise2[j]
+        to.snr[k] = sqrt(to.snr[k])
     pixels[0] = count
     return chi_square(p.weight, p.residual, p.count) / max(count - 3 * p.stars, 1)
 
@@ -559,10 +568,10 @@ def fit_stamps(
         raise ValueError(f"{column.shape[0]} stamps, {x.shape[1]} places, {rounds} rounds: {n} of each, 1 round or more")
     if not (1 <= stars == y.shape[0] <= STARS) or (stars > 1 and (least_flux is None or least_flux.shape[0] != n or weighed)):
         raise ValueError(f"{stars} stars to a stamp: 1, or {STARS} with least fluxes and without leverages")
-    columns_, covariances_, gains_ = np.empty((4, stars, n)), np.empty((stars, n, 2, 2)), np.empty((stars, n, rules.phases))
+    columns_, covariances_, gains_ = np.empty((5, stars, n)), np.empty((stars, n, 2, 2)), np.empty((stars, n, rules.phases))
     models_, residuals_ = np.empty((stars, n, size, size), np.float32), np.empty((n, size, size), np.float32)
     marks_, leverages_ = np.zeros((2, n, size, size), np.uint8), np.zeros((n, seen, seen), np.float32)
-    fits_ = np.empty((2, n))
+    fits_ = np.empty((3, n))
     cdef double[:, :, ::1] found = columns_
     cdef double[:, :, :, ::1] covariance = covariances_
     cdef double[:, :, ::1] gains = gains_
@@ -584,7 +593,8 @@ def fit_stamps(
             _fit(&s, &psf, rules, rounds, least, whole, &p, star, &to)
             _set_sigmas(stars, &to)
             fit[0, k] = _set_images(
-                &s, star, to.solved, &p, &model[0, k, 0], n * area, &residual[k, 0], &mark[0, k, 0], &mark[1, k, 0], &fit[1, k]
+                &s, star, &to, &p, &model[0, k, 0], n * area, &residual[k, 0], &mark[0, k, 0], &mark[1, k, 0], &fit[1, k],
+                &fit[2, k],
             )
             if weighed:
                 _set_leverages(&s, star, rules, &to, &p, &leverage[k, 0, 0])
@@ -592,14 +602,16 @@ def fit_stamps(
                 _move(star, stars, rules, least, to.step)
             for j in range(stars):
                 found[0, j, k], found[1, j, k], found[2, j, k] = star[j].x, star[j].y, star[j].flux
-                found[3, j, k] = to.sigma[j]
+                found[3, j, k], found[4, j, k] = to.sigma[j], to.snr[j]
                 for a in range(2):
                     for b in range(2):
                         at = (j * rules.unknowns + a) * to.unknowns + j * rules.unknowns + b
                         covariance[j, k, a, b] = to.covariance[at]
                 for a in range(rules.phases):
                     gains[j, k, a] = star[j].gain[a]
-    at_x, at_y, flux, sigma = columns_
+    at_x, at_y, flux, sigma, snr = columns_
     used, outlier = marks_.view(bool)
-    chi2, pixels = fits_
-    return at_x, at_y, flux, sigma, covariances_, gains_, chi2, pixels, residuals_, models_, used, outlier, leverages_
+    chi2, pixels, foreign = fits_
+    return (
+        at_x, at_y, flux, sigma, covariances_, gains_, chi2, pixels, residuals_, models_, used, outlier, leverages_, snr, foreign
+    )

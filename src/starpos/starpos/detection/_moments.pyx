@@ -5,13 +5,12 @@
 The latter are closed forms of what takes a library longer to begin than to do.
 """
 
-from libc.math cimport INFINITY, NAN, exp, fabs, isfinite, isnan, rint, sqrt
+from libc.math cimport INFINITY, NAN, exp, isfinite, isnan, rint, sqrt
 from libc.string cimport memcpy, memset
 
 import numpy as np
 
 cimport starpos._numeric.wide
-from starpos._numeric.algebra cimport middle
 from starpos._numeric.memory cimport room_for, start_of
 from starpos.detection._shapes cimport Shape, clipped_to, inverse, put_shape, shape_before, shape_of, sides, with_sides
 
@@ -130,22 +129,22 @@ cdef inline int _within(double place, int most) noexcept nogil:
     return <int>max(0.0, min(place, <double>most))
 
 
-cdef void _moments(const Image *image, const double *window, double left, double top, double *out) noexcept nogil:
-    """Set `out` (6,) to sum, mean x, y and covariance xx, xy, yy through a window (2, 2) px2; NaN without light."""
-    cdef double volume = window[0] * window[3] - window[1] * window[2]
-    cdef double xx = window[3] / volume, xy = -window[1] / volume, yy = window[0] / volume, change = exp(-yy)
+cdef void _moments(const Image *image, Shape window, double left, double top, double *out) noexcept nogil:
+    """Set `out` (6,) to sum, mean x, y and covariance xx, xy, yy through a window, px2; NaN without light."""
+    cdef Shape over = inverse(window)
+    cdef double change = exp(-over.yy)
     # from the row nearest to the window's middle to both sides
     cdef int middle = <int>max(0.0, min(rint(-top), image.size - 1.0)), k
-    cdef int begin = _within(-top - WIDTHS * sqrt(window[3]), middle), end
-    cdef int first = _within(-left - WIDTHS * sqrt(window[0]), image.size), last
-    end = 1 + _within(-top + WIDTHS * sqrt(window[3]) + 1, image.size - 1)
-    last = 1 + _within(-left + WIDTHS * sqrt(window[0]) + 1, image.size - 1)
+    cdef int begin = _within(-top - WIDTHS * sqrt(window.yy), middle), end
+    cdef int first = _within(-left - WIDTHS * sqrt(window.xx), image.size), last
+    end = 1 + _within(-top + WIDTHS * sqrt(window.yy) + 1, image.size - 1)
+    last = 1 + _within(-left + WIDTHS * sqrt(window.xx) + 1, image.size - 1)
     # in whole lanes
     last = first + (max(last - first, 1) + LANES - 1) // LANES * LANES
     first -= max(last - image.stride, 0)
     sum_columns(
         image.light + begin * image.stride + first, end - begin, image.stride, (min(last, image.stride) - first) // LANES,
-        middle - begin, left + first, top + middle, xx, xy, yy, change, out,
+        middle - begin, left + first, top + middle, over.xx, over.xy, over.yy, change, out,
     )
     if not out[0] > 0:
         for k in range(1, 6):
@@ -190,7 +189,7 @@ def window_moments(
     with nogil:
         for k in range(n):
             _load(&image, &signal[k, 0, 0])
-            _moments(&image, &window[k if window.shape[0] > 1 else 0, 0, 0], left[k], top[k], found)
+            _moments(&image, shape_of(window, k), left[k], top[k], found)
             mass[k], mean[k, 0], mean[k, 1] = found[0], found[1], found[2]
             shape[k, 0, 0], shape[k, 1, 1] = found[3], found[5]
             shape[k, 0, 1] = shape[k, 1, 0] = found[4]
@@ -199,61 +198,50 @@ def window_moments(
 
 def centroids(
     const float[:, :, ::1] signal, const Py_ssize_t[::1] column, const Py_ssize_t[::1] row,
-    const double[:, :, ::1] window, const double[:, :, ::1] gain, int rounds, double farthest,
+    const double[:, :, ::1] shape, double narrowest_window, int rounds, double farthest,
 ):
     """Places x, y (N,) px of N images (N, S, S) by the means of their light through windows, which go with the places.
 
-    column, row  (N,) of each image's middle, where it begins
-    window       (N, 2, 2) or (1, 2, 2): covariances of the windows, px2
-    gain         as many: a step over the mean through the window; at most 1 px
-    farthest     px from the beginning
+    column, row       (N,) of each image's middle, where it begins
+    shape             (N, 2, 2) or (1, 2, 2): covariances of the stars, px2, and of their windows
+    narrowest_window  px2, of a window
+    farthest          px from the beginning
     """
-    cdef int n = signal.shape[0], k, w
+    cdef int n = signal.shape[0], k
     cdef Image image
     cdef double[2] begin
-    _check_images(signal, column.shape[0], row.shape[0], window)
-    _check_images(signal, column.shape[0], row.shape[0], gain)
-    if gain.shape[0] != window.shape[0]:
-        raise ValueError(f"{window.shape[0]} windows and {gain.shape[0]} gains: as many are needed")
+    _check_images(signal, column.shape[0], row.shape[0], shape)
     out = np.empty((n, 2))
     cdef double[:, ::1] places = out
     room = _allocate(&image, signal.shape[1])
     with nogil:
         for k in range(n):
-            w = k if window.shape[0] > 1 else 0
             _load(&image, &signal[k, 0, 0])
             begin[0], begin[1] = column[k], row[k]
-            _centre(&image, &window[w, 0, 0], &gain[w, 0, 0], begin, rounds, farthest, &places[k, 0])
+            _centre(&image, shape_of(shape, k), narrowest_window, begin, rounds, farthest, &places[k, 0])
     return np.ascontiguousarray(out.T)
 
 
-cdef void _centre(
-    const Image *image, const double *window, const double *gain, const double *begin, int rounds, double farthest,
-    double *place,
+cdef Shape _centre(
+    const Image *image, Shape own, double narrowest_window, const double *begin, int rounds, double farthest, double *place
 ) noexcept nogil:
-    """Set place (2,) px by the mean of an image's light, as `centroids` explains."""
+    """Set place (2,) px by the mean of an image's light, as `centroids` explains; the window."""
+    cdef Shape window = clipped_to(own, narrowest_window, INFINITY, 1.0), over = inverse(window)
     cdef double[6] found
-    cdef double half = image.size // 2, step
-    cdef int round_, i
+    cdef double half = image.size // 2, x, y
+    cdef int round_
     place[0], place[1] = begin[0], begin[1]
     for round_ in range(rounds):
         _moments(image, window, begin[0] - half - place[0], begin[1] - half - place[1], found)
         # without light it stays where it is
         if not found[0] > 0:
             break
-        for i in range(2):
-            step = max(-1.0, min(gain[2 * i] * found[1] + gain[2 * i + 1] * found[2], 1.0))
-            place[i] = max(begin[i] - farthest, min(place[i] + step, begin[i] + farthest))
-
-
-cdef inline void _set_gain(Shape own, Shape of_window, double *gain) noexcept nogil:
-    """Set gain (2, 2): a star's step over the mean through a window, of whose covariance the inverse is given."""
-    gain[0], gain[1] = 1 + own.xx * of_window.xx + own.xy * of_window.xy, own.xx * of_window.xy + own.xy * of_window.yy
-    gain[2], gain[3] = own.xy * of_window.xx + own.yy * of_window.xy, 1 + own.xy * of_window.xy + own.yy * of_window.yy
-
-
-cdef inline void _set_window(Shape s, double *window) noexcept nogil:
-    window[0], window[1], window[2], window[3] = s.xx, s.xy, s.xy, s.yy
+        # through the window an offset looks smaller than it is
+        x, y = over.xx * found[1] + over.xy * found[2], over.xy * found[1] + over.yy * found[2]
+        x, y = found[1] + own.xx * x + own.xy * y, found[2] + own.xy * x + own.yy * y
+        place[0] = max(begin[0] - farthest, min(place[0] + max(-1.0, min(x, 1.0)), begin[0] + farthest))
+        place[1] = max(begin[1] - farthest, min(place[1] + max(-1.0, min(y, 1.0)), begin[1] + farthest))
+    return window
 
 
 def own_shapes(
@@ -274,8 +262,6 @@ def own_shapes(
     cdef double half = signal.shape[1] // 2, low, high
     cdef Image image
     cdef Shape own, through
-    cdef double[4] window
-    cdef double[4] gain
     cdef double[2] begin
     cdef double[2] place
     cdef double[6] found
@@ -292,11 +278,8 @@ def own_shapes(
             _load(&image, &signal[k, 0, 0])
             own = Shape(first, 0.0, first)
             for round_ in range(rounds):
-                through = clipped_to(own, narrowest_window, INFINITY, 1.0)
-                _set_window(through, window)
-                _set_gain(own, inverse(through), gain)
-                _centre(&image, window, gain, begin, centring if round_ else 0, farthest, place)
-                _moments(&image, window, -place[0], -place[1], found)
+                through = _centre(&image, own, narrowest_window, begin, centring if round_ else 0, farthest, place)
+                _moments(&image, through, -place[0], -place[1], found)
                 own = shape_before(Shape(found[3], found[4], found[5]), through)
                 if isnan(own.xx):
                     own = Shape(widest, 0.0, widest)
@@ -307,70 +290,6 @@ def own_shapes(
             width[k, 0], width[k, 1] = low, high
             put_shape(shape, k, own)
     return out, widths
-
-
-def typical_shape(
-    const float[:, :, ::1] signal, double first, double narrowest_window, double narrowest, double widest, int rounds,
-    double farthest, double thinnest, double enough,
-):
-    """The typical covariance (2, 2) px2 of N images (N, S, S), through a window of that shape; None if all fail.
-
-    first                px2 along any axis, of the first window
-    narrowest_window     px2, of the others
-    narrowest, widest    px2: limits of the covariance
-    farthest, thinnest   an image counts whose mean is nearer (px) than that, and whose image is wider (px2)
-    enough               relative change at which it is settled, before so many rounds
-    """
-    cdef int n = signal.shape[0], k, j, round_, count
-    cdef double half = signal.shape[1] // 2, change = INFINITY
-    cdef Image image
-    cdef Shape own = Shape(NAN, NAN, NAN), through = Shape(first, 0.0, first), of_seen, of_window, before
-    cdef double[4] window
-    cdef double[4] gain
-    cdef double *found
-    if signal.shape[1] != signal.shape[2]:
-        raise ValueError(f"images of {signal.shape[2]} x {signal.shape[1]} px: they must be square")
-    room = _allocate(&image, signal.shape[1])
-    # of each image its place and moments; of the images that count each of three moments
-    of_images = room_for(11 * n * sizeof(double))
-    cdef double *places = <double *>start_of(of_images)
-    cdef double *seen = places + 8 * n
-    with nogil:
-        for k in range(n):
-            places[8 * k] = places[8 * k + 1] = half
-        for round_ in range(rounds):
-            count = 0
-            _set_window(through, window)
-            for k in range(n):
-                found = places + 8 * k
-                _load(&image, &signal[k, 0, 0])
-                _moments(&image, window, -found[0], -found[1], found + 2)
-                if not (fabs(found[3]) < farthest and fabs(found[4]) < farthest):
-                    found[2] = 0.0
-                elif not sides(Shape(found[5], found[6], found[7]))[0] > thinnest:
-                    found[2] = 0.0
-                if found[2] > 0:
-                    for j in range(3):
-                        seen[j * n + count] = found[5 + j]
-                    count += 1
-            if not count:
-                break
-            of_seen = inverse(Shape(middle(seen, count), middle(seen + n, count), middle(seen + 2 * n, count)))
-            of_window, before = inverse(through), own
-            own = clipped_to(
-                Shape(of_seen.xx - of_window.xx, of_seen.xy - of_window.xy, of_seen.yy - of_window.yy), 1 / widest,
-                1 / narrowest, -1.0,
-            )
-            _set_gain(own, of_window, gain)
-            for k in range(n):
-                found = places + 8 * k
-                for j in range(2 if found[2] > 0 else 0):
-                    found[j] += max(-1.0, min(gain[2 * j] * found[3] + gain[2 * j + 1] * found[4], 1.0))
-            change = max(max(fabs(own.xx - before.xx), fabs(own.xy - before.xy)), fabs(own.yy - before.yy))
-            through = clipped_to(own, narrowest_window, INFINITY, 1.0)
-            if change < enough * max(own.xx, own.yy):
-                break
-    return None if isnan(own.xx) else np.array([[own.xx, own.xy], [own.xy, own.yy]])
 
 
 cdef Py_ssize_t _count(const double[:, :, ::1] one, const double[:, :, ::1] other, const double[:, :, ::1] more) except -1:
@@ -386,17 +305,6 @@ cdef Py_ssize_t _count(const double[:, :, ::1] one, const double[:, :, ::1] othe
         if count not in (1, n) or (rows, columns) != (2, 2):
             raise ValueError(f"{count} matrices of {rows} x {columns}: {n} of 2 x 2 are needed, or one")
     return n
-
-
-def invert_shapes(const double[:, :, ::1] shape):
-    """Inverses of covariances (N, 2, 2)."""
-    cdef Py_ssize_t n = _count(shape, shape, shape), k
-    out = np.empty((n, 2, 2))
-    cdef double[:, :, ::1] found = out
-    with nogil:
-        for k in range(n):
-            put_shape(found, k, inverse(shape_of(shape, k)))
-    return out
 
 
 def squared_widths(const double[:, :, ::1] shape):
@@ -421,21 +329,8 @@ def clip_widths(const double[:, :, ::1] shape, double least, double most, double
     return out
 
 
-def through_window(const double[:, :, ::1] shape, const double[:, :, ::1] window):
-    """Covariances (N, 2, 2) of the images of stars of covariance `shape` through windows, each (N, 2, 2) or (1, 2, 2)."""
-    cdef Py_ssize_t n = _count(shape, window, window), k
-    cdef Shape a, b
-    out = np.empty((n, 2, 2))
-    cdef double[:, :, ::1] found = out
-    with nogil:
-        for k in range(n):
-            a, b = inverse(shape_of(shape, k)), inverse(shape_of(window, k))
-            put_shape(found, k, inverse(Shape(a.xx + b.xx, a.xy + b.xy, a.yy + b.yy)))
-    return out
-
-
 def without_window(const double[:, :, ::1] seen, const double[:, :, ::1] window):
-    """Covariances (N, 2, 2) of stars whose images through windows are seen; NaN where none is. The reverse of `through_window`."""
+    """Covariances (N, 2, 2) of stars whose images through windows are seen; NaN where none is."""
     cdef Py_ssize_t n = _count(seen, window, window), k
     out = np.empty((n, 2, 2))
     cdef double[:, :, ::1] found = out
@@ -445,16 +340,21 @@ def without_window(const double[:, :, ::1] seen, const double[:, :, ::1] window)
     return out
 
 
-def width_ratios(const double[:, :, ::1] seen, const double[:, :, ::1] expected):
-    """The smaller and the larger squared width (N, 2) of images, over those of expected ones; 0 for what is not a number."""
-    cdef Py_ssize_t n = _count(seen, expected, expected), k
+def relative_widths(const double[:, :, ::1] seen, const double[:, :, ::1] shape, const double[:, :, ::1] window):
+    """The smaller and the larger squared width (N, 2) of images through windows, over the widths of stars of this shape.
+
+    Both are 1 for a star of that shape and near 0 for a hot pixel. Along a streak the larger reaches 2 if the window is
+    the shape. NaN counts as 0.
+    """
+    cdef Py_ssize_t n = _count(seen, shape, window), k
     cdef double a, b, c
-    cdef Shape s, e
+    cdef Shape s, e, w
     out = np.zeros((n, 2))
     cdef double[:, ::1] width = out
     with nogil:
         for k in range(n):
-            s, e = shape_of(seen, k), shape_of(expected, k)
+            s, e, w = shape_of(seen, k), inverse(shape_of(shape, k)), inverse(shape_of(window, k))
+            e = inverse(Shape(e.xx + w.xx, e.xy + w.xy, e.yy + w.yy))
             # by the Cholesky factor of the expected one, a 0, b c
             a = sqrt(e.xx)
             b = e.xy / a

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-"""The 8- or 16-bit pixels of a plane (h, w): stamps around stars, hot pixels and the sky around peaks, bright squares.
+"""The 8- or 16-bit pixels of a plane (h, w): stamps around stars, hot pixels and the sky around peaks.
 
 A pixel beyond the frame is the nearest one on it. level, noise (N, P) DN are of the sky at each of N stars or peaks x, y (N,)
 px, P = 1, or 4 for the phases of a colour mosaic.
@@ -256,41 +256,6 @@ cdef bint _is_flat(const pixel_t *block, Py_ssize_t width) noexcept nogil:
             if block[y * width + x] != block[0]:
                 return False
     return True
-
-
-def bright_squares(const pixel_t[:, ::1] plane, const int[::1] highest, int step, int limit):
-    """Pixels of every `step`-th row and column of a plane that are above a limit, with one more to the right and below.
-
-    highest (h,): of each row the highest pixel
-
-    Returns their rows and columns (N,), px, and the lowest of the 2 x 2 pixels of which each is the first, (N,).
-    """
-    cdef Py_ssize_t height = plane.shape[0], width = plane.shape[1], count = 0, i, j, x
-    cdef Py_ssize_t down, across
-    cdef const pixel_t *line
-    if step < 1 or not (height and width) or highest.shape[0] != height:
-        raise ValueError(f"steps of {step} px, {highest.shape[0]} rows in a frame of {width} x {height} px: there is nothing to see")
-    down, across = (height + step - 2) // step, (width + step - 2) // step
-    with nogil:
-        for i in range(down):
-            line = &plane[i * step, 0]
-            # most rows hold nothing bright
-            for j in range(across if highest[i * step] > limit else 0):
-                count += line[j * step] > limit
-    places_, lowest_ = np.empty((2, count), np.intp), np.empty(count)
-    cdef Py_ssize_t[:, ::1] place = places_
-    cdef double[::1] lowest = lowest_
-    count = 0
-    with nogil:
-        for i in range(down):
-            line = &plane[i * step, 0]
-            for j in range(across if highest[i * step] > limit else 0):
-                x = j * step
-                if line[x] > limit:
-                    place[0, count], place[1, count] = i * step, x
-                    lowest[count] = min(min(line[x], line[x + 1]), min(line[width + x], line[width + x + 1]))
-                    count += 1
-    return places_[0], places_[1], lowest_
 
 
 def third_highest(const pixel_t[:, ::1] plane, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y, int reach):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-"""What the pixels of stamps say of their stars: the sky at their rims, spikes, other light, and whether one pixel is all."""
+"""What the pixels of stamps say of their stars: the sky at their rims, spikes, and whether one pixel is all."""
 
-from libc.math cimport log, sqrt
+from libc.math cimport log
 
 import numpy as np
 
@@ -127,84 +127,6 @@ cdef float _beside(const float *signal, const unsigned char *phase, const float 
     return total * <float>0.25
 
 
-def restore_model(
-    float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] spike,
-    const float[:, :, ::1] model, const unsigned char[:, :, ::1] outlier, int speck, float loud,
-):
-    """Put the model into pixels of stamps (N, S, S), in place, that say nothing about the star's own shape.
-
-    These are spikes; outliers, if there are not more than `speck`; and pixels with `loud` times the quietest one's noise.
-    """
-    cdef Py_ssize_t n = signal.shape[0], k
-    cdef int area = signal.shape[1] * signal.shape[1], j, outliers
-    cdef float least
-    cdef float *own
-    cdef const float *sky
-    check_stamps(signal.shape, 4, [&noise.shape[0], &spike.shape[0], &model.shape[0], &outlier.shape[0]])
-    with nogil:
-        for k in range(n):
-            own, sky, outliers, least = &signal[k, 0, 0], &noise[k, 0, 0], 0, noise[k, 0, 0]
-            for j in range(area):
-                outliers += (&outlier[k, 0, 0])[j]
-                least = min(least, sky[j])
-            for j in range(area):
-                if (&spike[k, 0, 0])[j] or sky[j] > loud * least or (outliers <= speck and (&outlier[k, 0, 0])[j]):
-                    own[j] = (&model[k, 0, 0])[j]
-
-
-def describe_stars(
-    const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
-    const unsigned char[:, :, ::1] full, const unsigned char[:, :, ::1] spike, const float[:, :, ::1] residual,
-    const float[:, :, ::1] model, const unsigned char[:, :, ::1] used, const unsigned char[:, :, ::1] outlier,
-    const double[::1] left, const double[::1] top, const double[:, :, ::1] axes, double core, double wider,
-):
-    """How fitted stars look in their stamps (N, S, S).
-
-    left, top    (N,) px: of each stamp's first column and row from its star
-    axes         (N, 2, 2) or (1, 2, 2): of the PSF
-    core, wider  widths of the PSF around the star
-
-    Returns columns (N,): the star's SNR in the sky's noise; the light of the outliers; and whether a pixel is saturated
-    within the core, and whether one is neither good nor saturated nor a spike within the wider one.
-    """
-    cdef Py_ssize_t n = signal.shape[0], k, a
-    cdef int size = signal.shape[1], row, column, place
-    cdef double dx, dy, u, v, distance2, score, matched, foreign, near2 = core * core, far2 = wider * wider
-    check_stamps(signal.shape, 8, [
-        &noise.shape[0], &good.shape[0], &full.shape[0], &spike.shape[0], &residual.shape[0], &model.shape[0],
-        &used.shape[0], &outlier.shape[0]
-    ])
-    if left.shape[0] != n or top.shape[0] != n or axes.shape[0] not in (1, n) or axes.shape[1] != 2 or axes.shape[2] != 2:
-        raise ValueError(f"{left.shape[0]} places and {axes.shape[0]} axes for {n} stars: one each is needed")
-    sums_, marks_ = np.empty((2, n)), np.zeros((2, n), np.uint8)
-    cdef double[:, ::1] sums = sums_
-    cdef unsigned char[:, ::1] marks = marks_
-    with nogil:
-        for k in range(n):
-            matched = foreign = 0.0
-            a = k if axes.shape[0] > 1 else 0
-            for row in range(size):
-                dy = top[k] + row
-                for column in range(size):
-                    if used[k, row, column]:
-                        score = model[k, row, column] / noise[k, row, column]
-                        matched += score * score
-                    if outlier[k, row, column] and residual[k, row, column] > 0:
-                        foreign += residual[k, row, column]
-                    if good[k, row, column]:
-                        continue
-                    dx = left[k] + column
-                    u, v = axes[a, 0, 0] * dx + axes[a, 0, 1] * dy, axes[a, 1, 0] * dx + axes[a, 1, 1] * dy
-                    distance2 = u * u + v * v
-                    if full[k, row, column]:
-                        marks[0, k] |= distance2 < near2
-                    elif not spike[k, row, column]:
-                        marks[1, k] |= distance2 < far2
-            sums[0, k], sums[1, k] = sqrt(matched), foreign
-    at_limit, cut_off = marks_.view(bool)
-    return sums_[0], sums_[1], at_limit, cut_off
-
-
 def compare_with_pixel(
     const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
     const unsigned char[:, :, ::1] full, const float[:, :, ::1] residual, const float[:, :, ::1] model,
@@ -243,62 +165,3 @@ def compare_with_pixel(
                     star += residual[k, row, column] * residual[k, row, column] / variance + log(variance / sky2)
             sums[0, k], sums[1, k], counts[0, k], counts[1, k] = one - most, star, count, white
     return sums_[0], sums_[1], counts_[0], counts_[1]
-
-
-def brightest_left(
-    const float[:, :, ::1] residual, const unsigned char[:, :, ::1] good, const double[::1] left, const double[::1] top,
-    const double[:, :, ::1] axes, double nearest, double widths, const double[::1] weight,
-):
-    """Row and column (N,) of the pixel where a fit leaves the most light, of the good pixels smoothed.
-
-    left, top        (N,) px: of each stamp's (N, S, S) first column and row from its star
-    axes             (N, 2, 2) or (1, 2, 2): of the PSF
-    nearest, widths  the pixel is not nearer to the star (px), and within so many widths of the PSF
-    weight           (reach + 1,): of the smoothing, from the middle outwards, along both axes; images end as in a mirror
-    """
-    cdef Py_ssize_t n = residual.shape[0], k, a
-    cdef int size = residual.shape[1], reach = weight.shape[0] - 1, row, column, j
-    cdef double dx, dy, u, v, value, most
-    check_stamps(residual.shape, 1, [&good.shape[0]])
-    if left.shape[0] != n or top.shape[0] != n or axes.shape[0] not in (1, n) or axes.shape[1] != 2 or axes.shape[2] != 2:
-        raise ValueError(f"{left.shape[0]} places and {axes.shape[0]} axes for {n} stars: one each is needed")
-    if not 0 <= reach < size:
-        raise ValueError(f"a smoothing that reaches {reach} px in stamps of {size} px")
-    out = np.zeros((2, n), np.intp)
-    cdef Py_ssize_t[:, ::1] place = out
-    room = room_for(2 * size * size * sizeof(double))
-    cdef double *plain = <double *>start_of(room)
-    cdef double *across = plain + size * size
-    with nogil:
-        for k in range(n):
-            a, most = k if axes.shape[0] > 1 else 0, -1e300
-            for j in range(size * size):
-                plain[j] = (&residual[k, 0, 0])[j] if (&good[k, 0, 0])[j] else 0.0
-            for row in range(size):
-                for column in range(size):
-                    value = weight[0] * plain[row * size + column]
-                    for j in range(1, reach + 1):
-                        value += weight[j] * (
-                            plain[_mirrored(row - j, size) * size + column] + plain[_mirrored(row + j, size) * size + column]
-                        )
-                    across[row * size + column] = value
-            for row in range(size):
-                dy = top[k] + row
-                for column in range(size):
-                    dx = left[k] + column
-                    u, v = axes[a, 0, 0] * dx + axes[a, 0, 1] * dy, axes[a, 1, 0] * dx + axes[a, 1, 1] * dy
-                    if dx * dx + dy * dy < nearest * nearest or not u * u + v * v < widths * widths:
-                        continue
-                    value = weight[0] * across[row * size + column]
-                    for j in range(1, reach + 1):
-                        value += weight[j] * (
-                            across[row * size + _mirrored(column - j, size)] + across[row * size + _mirrored(column + j, size)]
-                        )
-                    if value > most:
-                        most, place[0, k], place[1, k] = value, row, column
-    return out[0], out[1]
-
-
-cdef inline int _mirrored(int k, int n) noexcept nogil:
-    """The pixel that stands for k beyond the edges of n: the first one again, and so on."""
-    return -k - 1 if k < 0 else 2 * n - 1 - k if k >= n else k

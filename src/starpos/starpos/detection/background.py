@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from starpos.detection._pixels import any_flat
-from starpos.detection._sky import even_out, median, sample_sky, sky_at
+from starpos.detection._sky import median, sample_sky, sky_at
 from starpos.frames.frame import Frame, Window
 from starpos.units import SIGMA_PER_MAD
 
@@ -214,9 +214,37 @@ def measure_sky(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None = None
     error = np.maximum(noise, QUANTISATION) * samples**-0.5
     # cells that differ by more lie at an edge, of a roof for example
     steep = STEEP * np.array([median(e) for e in error.reshape(len(error), -1)])
-    level, noise = even_out(level, steep, False), even_out(noise, steep, True)
+    level, noise = (
+        np.stack([_evened(*one, goes_on) for one in zip(mesh, steep, strict=True)])
+        for mesh, goes_on in ((level, True), (noise, False))
+    )
     noise = np.maximum(noise, max(QUANTISATION, _lost_noise(plane)))
     return SkyPlane(plane=plane, level=level, noise=noise)
+
+
+def _evened(mesh: np.ndarray, steep: float, goes_on: bool) -> np.ndarray:
+    """A mesh (rows, columns) evened out: (rows + 2, columns + 2), with one more cell beyond each edge.
+
+    A median of 3 x 3 cells replaces those that something bright covers, then a mean evens out their noise.
+
+    steep    the mean is left out where it differs by more from the median, across an edge (of a roof)
+    goes_on  whether a gradient goes on beyond the edge; else it ends there
+    """
+    base = mesh.mean()
+    around = np.pad(mesh - base, 2, "reflect", reflect_type="odd").astype(np.float32)
+    typical = cv2.medianBlur(around, 3)
+    mean = cv2.blur(typical, (3, 3))
+    even = np.where(np.abs(mean - typical) < steep, mean, typical)[2:-2, 2:-2] + base
+    return np.pad(even, 1, "reflect", reflect_type="odd") if goes_on else np.pad(even, 1, "edge")
+
+
+def between(mesh: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """The values (R, C) of a mesh at rows (R,) and columns (C,), with fractions, as `SkyPlane.cell` gives them."""
+    for place in (columns, rows):
+        low = place.astype(int)
+        share = (place - low).astype(mesh.dtype)[:, None]
+        mesh = (1 - share) * mesh.T[low] + share * mesh.T[low + 1]
+    return mesh
 
 
 def _beside_lamps(white: np.ndarray, level: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,15 +9,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from starpos.detection._sky import median
 from starpos.detection.saturated import round_shape
 from starpos.frames.frame import Disc
 
 # Frames are searched at steps of their shorter side over this, px, or of 2. Minimum radius, px, and number of bright
 # groups that are tried.
 COARSE, LEAST_PX, TRIED = 800, 4.0, 4
-# The dark part of a frame is at this percentile of some rows and columns; a disc is higher by this share of the top,
+# The dark part of a frame is at this quantile of some rows and columns; a disc is higher by this share of the top,
 # and that many sigma.
-SOME, DARK, CONTRAST, CLEAR = 80, 20.0, 0.3, 20.0
+SOME, DARK, CONTRAST, CLEAR = 80, 0.2, 0.3, 20.0
 # Directions from a bright group's middle, in each of which its edge is looked for.
 RAYS = 360
 # Minimum slope of an edge, as a share of the disc's height a px, and of the steepest of its direction.
@@ -58,8 +59,8 @@ def find_disc(plane: np.ndarray) -> Disc | None:
     wide = cv2.erode(np.ascontiguousarray(plane[::step, ::step]), np.ones((3, 3), np.uint8))
     every = max(1, min(wide.shape) // SOME)
     some = wide[::every, ::every].astype(float)
-    dark, top = float(np.percentile(some, DARK)), float(wide.max())
-    noise = float(np.median(np.abs(np.diff(some, axis=1)))) + 1.0
+    dark, top = float(np.sort(some, axis=None)[int(DARK * (some.size - 1))]), float(wide.max())
+    noise = median(np.abs(np.diff(some, axis=1)).ravel()) + 1.0
     height = top - dark
     if height < max(CONTRAST * top, CLEAR * noise):
         return None

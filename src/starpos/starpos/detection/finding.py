@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 from scipy import ndimage, spatial
 
-from starpos.detection._neighbours import group_points, near_pairs
 from starpos.detection._peaks import find_maxima, smooth_rows
-from starpos.detection._sky import interpolated, median, scores
-from starpos.detection.background import SkyPlane
+from starpos.detection._sky import median
+from starpos.detection.background import SkyPlane, between
 from starpos.detection.stamps import are_alone, are_dots, surroundings
 from starpos.units import SIGMA_PER_MAD
 
@@ -87,9 +86,12 @@ def find_streaks(sky: SkyPlane, x: np.ndarray, y: np.ndarray) -> tuple[Streak, .
 
 
 def _may_be_a_line(x: np.ndarray, y: np.ndarray) -> bool:
-    """Whether enough peaks x, y (N,) int px are joined by gaps that a line may have."""
-    pairs = near_pairs(x.astype(float), y.astype(float), np.sqrt(2) * (GAP + 2) * CELL)
-    return len(pairs) > 0 and bool(np.bincount(group_points(pairs, len(x))).max() >= FEWEST)
+    """Whether enough peaks x, y (N,) int px have neighbours within the gaps that a line may have."""
+    pairs = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(
+        np.sqrt(2) * (GAP + 2) * CELL, output_type="ndarray"
+    )
+    # all but the ends of a line have two neighbours
+    return bool(np.count_nonzero(np.bincount(pairs.ravel()) > 1) >= FEWEST - 2)
 
 
 def _through(points: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -206,6 +208,11 @@ class Peaks:
     highest: np.ndarray
     left_out: int = 0
 
+    @property
+    def points(self) -> np.ndarray:
+        """Places (N, 2) px."""
+        return np.stack([self.x, self.y], 1)
+
 
 def find_peaks(sky: SkyPlane, threshold: float, limit: int, threads: int = 1) -> Peaks:
     """Find at most `limit` Peaks that stand out of the sky by `threshold` sigma.
@@ -237,7 +244,7 @@ def _crowded(peaks: Peaks) -> bool:
         return False
     leaders = min(len(peaks.x), LEADERS)
     alike = peaks.height > 0.5 * peaks.height[leaders - 1]
-    pairs = near_pairs(peaks.x[alike].astype(float), peaks.y[alike].astype(float), CROWD)
+    pairs = spatial.cKDTree(peaks.points[alike]).query_pairs(CROWD, output_type="ndarray")
     return len(np.unique(pairs[pairs < leaders])) > leaders / 2
 
 
@@ -246,7 +253,7 @@ def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
 
     Peaks on a line do not count. Nor do those at the edge of the frame, size (height, width) px, where a line ends.
     """
-    points, centres = (np.stack([peaks.x, peaks.y], 1) for peaks in (sharp, wide))
+    points, centres = sharp.points, wide.points
     apart, near = spatial.cKDTree(points).query(centres, NEAREST, distance_upper_bound=2 * CROWD)
     height = np.append(sharp.height, 0)[near]
     inside = apart < 0.7 * CROWD
@@ -267,7 +274,7 @@ def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
 
 def _with_others(wide: Peaks, sharp: Peaks, limit: int) -> Peaks:
     """The wide peaks, and the highest sharp one of each group that is far from them: of rings that the noise hides."""
-    points, centres = (np.stack([peaks.x, peaks.y], 1) for peaks in (sharp, wide))
+    points, centres = sharp.points, wide.points
     far = spatial.cKDTree(centres).query(points)[0] > CROWD
     pairs = spatial.cKDTree(points).query_pairs(CROWD, output_type="ndarray")
     # the peaks are sorted: the second of a pair is the lower one
@@ -287,30 +294,30 @@ def _peaks_of(sky: SkyPlane, kernel: Kernel, threshold: float, limit: int, threa
     A colour mosaic leaves no trace in the smoothed frame: it is a pattern at the Nyquist frequency, where the kernel's
     response vanishes.
     """
-    correlation, unevenness = _noise_of_smooth(sky, kernel)
+    level, noise = (v.astype(np.float32) for v in (sky.level.mean(0), np.sqrt((sky.noise**2).mean(0))))
+    correlation, unevenness = _noise_of_smooth(sky, kernel, level, noise)
     threshold = threshold * unevenness
-    level, noise = sky.level.mean(0), np.sqrt((sky.noise**2).mean(0))
-    noise = noise * kernel.norm * correlation
+    norm = kernel.norm * correlation
     # each strip against the lowest threshold of its mesh rows; the exact threshold follows below
     strips = np.arange(0, sky.height, STRIP)
     (first, last), _ = sky.cell(0, np.stack([strips, np.minimum(strips + STRIP, sky.height) - 1]))
     first, last = first.astype(int), last.astype(int) + 1
     rows = np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
-    floor = (level + threshold * noise).astype(np.float32)[rows].min(1)
+    floor = (level + threshold * norm * noise)[rows].min(1)
     x, y, value, highest = _in_parts(sky.plane, kernel, floor, threads)
     x, y = np.rint(x).astype(int), np.rint(y).astype(int)
-    local, sigma = interpolated(np.stack([level, noise]), *sky.cell(x, y)).T
-    height = (value - local) / sigma
+    local, sigma = sky.near(x, y)
+    height = (value - local.mean(1)) / (norm * np.sqrt((sigma**2).mean(1)))
     left_out = max(0, len(height) - 4 * limit)
     keep = np.argsort(-height, kind="stable")[: 4 * limit]
-    x, y, height = x[keep].astype(int), y[keep].astype(int), height[keep]
+    x, y, height = x[keep], y[keep], height[keep]
     starlike = ~are_alone(sky, x, y)
     x, y, height = x[starlike], y[starlike], height[starlike]
     raised, uneven = surroundings(sky, x, y, round(6.7 * kernel.sigma))
-    height = (height - raised / (kernel.norm * correlation)) / uneven
+    height = (height - raised / norm) / uneven
     keep = (height > _above_tail(height, threshold)).nonzero()[0]
     keep = keep[np.argsort(-height[keep], kind="stable")]
-    x, y, height = _join_plateaus(x[keep], y[keep], height[keep], kernel.flat)
+    x, y, height = x[keep], y[keep], height[keep]
     left_out += max(0, len(x) - limit)
     return Peaks(
         x=x[:limit],
@@ -338,7 +345,9 @@ def _in_parts(plane: np.ndarray, kernel: Kernel, limit: np.ndarray, threads: int
         )
 
 
-def _noise_of_smooth(sky: SkyPlane, kernel: Kernel) -> tuple[float, float]:
+def _noise_of_smooth(
+    sky: SkyPlane, kernel: Kernel, level: np.ndarray, noise: np.ndarray
+) -> tuple[float, float]:
     """Two factors, 1 or more each, by which a smoothed frame is noisier than with independent pixels.
 
     The first is the correlation of neighbouring pixels, from demosaicing, resampling or lossy compression: it lowers the
@@ -349,7 +358,7 @@ def _noise_of_smooth(sky: SkyPlane, kernel: Kernel) -> tuple[float, float]:
     rows = (tops[:, None] + np.arange(0, min(16, len(plane)), 4)).ravel()
     value = smooth_rows(plane, kernel.weight, rows, 4)
     place = sky.cell(np.arange(0, plane.shape[1], 4), rows)
-    score = scores(value, sky.level, sky.noise, *place)
+    score = (value - between(level, *place)) / between(noise, *place)
     # stars widen the scatter upwards; where they are many, only the lowest values are free of them
     low, sigma_below, usual = _low_side(score.ravel())
     scatter = min(usual - sigma_below, sigma_below - low) / kernel.norm
@@ -406,24 +415,3 @@ def _above_tail(height: np.ndarray, threshold: float) -> float:
             break
         threshold *= 1.1
     return threshold
-
-
-def _join_plateaus(
-    x: np.ndarray, y: np.ndarray, height: np.ndarray, flat: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Peaks x, y, height (N,) with one peak in the middle of each plateau of a saturated star."""
-    pairs = near_pairs(x.astype(float), y.astype(float), flat + 0.5)
-    if len(pairs) == 0:
-        return x.astype(int), y.astype(int), height
-    x, y, height = _merged(x, y, height, group_points(pairs, len(x)))
-    order = np.argsort(-height, kind="stable")
-    return x[order], y[order], height[order]
-
-
-def _merged(
-    x: np.ndarray, y: np.ndarray, value: np.ndarray, group: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Middle x, y and mean value of each group of peaks; group (N,) numbers them from 0."""
-    count = np.bincount(group)
-    x, y = (np.rint(np.bincount(group, v) / count).astype(int) for v in (x, y))
-    return x, y, np.bincount(group, value) / count

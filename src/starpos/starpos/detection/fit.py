@@ -5,9 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from scipy import ndimage
 
 from starpos.detection._fit import Rules, fit_stamps
-from starpos.detection._vetting import brightest_left
 from starpos.detection.psf import Psf
 from starpos.detection.stamps import Stamps, StarRows, joined
 
@@ -72,6 +72,8 @@ class Fit(StarRows):
     outlier           (N, S, S) bool: pixels left out because they are much too bright for this star
     leverage          (N, S, S), 0..1: a residual's variance is (1 - leverage) times the noise's; empty if not
                       asked for
+    sky_snr           (N,) SNR in the sky's noise alone
+    foreign           (N,) DN: light of the outliers beyond the model
     """
 
     x: np.ndarray
@@ -87,11 +89,14 @@ class Fit(StarRows):
     used: np.ndarray
     outlier: np.ndarray
     leverage: np.ndarray
+    sky_snr: np.ndarray
+    foreign: np.ndarray
 
 
 # Columns of a Fit, and whether each of several stars in one stamp has its own; the others are the stamp's.
 COLUMNS = {
-    f.name: f.name in ("x", "y", "flux", "flux_sigma", "covariance", "gains", "model") for f in fields(Fit)
+    f.name: f.name in ("x", "y", "flux", "flux_sigma", "covariance", "gains", "model", "sky_snr")
+    for f in fields(Fit)
 }
 
 
@@ -164,9 +169,8 @@ FAINTEST = 5.0
 GAIN = 30.0
 # Companions fainter than this share of the star may be faults of the PSF.
 DIMMEST = 0.03
-# It is looked for at least so far (px) from the star, with a Gaussian of 0.8 px, from its middle outwards.
-NEAREST_PX, SMOOTHING = 1.0, np.exp(-0.5 * (np.arange(4) / 0.8) ** 2)
-SMOOTHING /= 2 * SMOOTHING.sum() - SMOOTHING[0]
+# It is looked for at least so far (px) from the star, with a Gaussian of this sigma (px).
+NEAREST_PX, SMOOTHED_PX = 1.0, 0.8
 
 
 def split_pairs(
@@ -244,14 +248,13 @@ def _model_light(stamps: Stamps, psf: Psf, fit: Fit) -> np.ndarray:
 
 def _first_places(stamps: Stamps, fit: Fit, psf: Psf) -> np.ndarray:
     """First places (2, 2, N) px of pairs: the star's, and the pixel off its centre where its fit leaves most light."""
-    row, column = brightest_left(
-        fit.residual,
-        stamps.good,
-        *stamps.corner(fit.x, fit.y),
-        psf.at(fit.x, fit.y).axes,
-        NEAREST_PX,
-        FIT_WIDTHS + 2,
-        SMOOTHING,
+    light = ndimage.gaussian_filter(fit.residual * stamps.good, (0, SMOOTHED_PX, SMOOTHED_PX))
+    (left, top), grid = stamps.corner(fit.x, fit.y), np.arange(stamps.size)
+    dx, dy = (left[:, None] + grid)[:, None], (top[:, None] + grid)[..., None]
+    u, v = (
+        i[:, None, None] * dx + j[:, None, None] * dy for i, j in psf.at(fit.x, fit.y).axes.transpose(1, 2, 0)
     )
+    light[(dx * dx + dy * dy < NEAREST_PX**2) | (u * u + v * v >= (FIT_WIDTHS + 2) ** 2)] = -np.inf
+    row, column = np.divmod(light.reshape(len(light), -1).argmax(1), stamps.size)
     left, top = stamps.x - stamps.reach, stamps.y - stamps.reach
     return np.array([[fit.x, left + column], [fit.y, top + row]])

@@ -7,23 +7,21 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import spatial
+from scipy.linalg import lapack
 
-from starpos.detection._learn import (
-    choose_terms,
-    fit_field_robustly,
-    light_noise,
-    marginal_equations,
-    phase_fluxes,
-    strangeness,
-    typical_gains,
-    unit_light,
+from starpos.detection._learn import light_noise, marginal_equations
+from starpos.detection._moments import (
+    clip_widths,
+    own_shapes,
+    relative_widths,
+    squared_widths,
+    window_moments,
+    without_window,
 )
-from starpos.detection._moments import own_shapes, squared_widths, window_moments, without_window
-from starpos.detection._neighbours import near_pairs
 from starpos.detection._pixels import smooth_mosaic
-from starpos.detection._sky import median, quantile
+from starpos.detection._sky import median
 from starpos.detection.background import SkyPlane
-from starpos.detection.fit import Fit, Response, fit_stars
+from starpos.detection.fit import Fit, Response, fit_stars, gains_at
 from starpos.detection.psf import BROAD, MONOMIALS, NARROW, Psf, gaussian, power
 from starpos.detection.stamps import (
     FARTHEST,
@@ -33,8 +31,6 @@ from starpos.detection.stamps import (
     are_dots,
     centroid,
     cut,
-    frame_shape,
-    relative_widths,
     window_for,
 )
 
@@ -42,8 +38,8 @@ from starpos.detection.stamps import (
 PLACES = 12
 # and widths that vary over the field must be better than constant ones by this F.
 SIGNIFICANT = 4.0
-# and maximum distance of any of these stars from it, over the median distance.
-OUTLYING = 6.0
+# and maximum distance of any of these stars from it, over the median distance, in so many rounds.
+OUTLYING, FIELD_ROUNDS = 6.0, 4
 # Prior of each coefficient, 1 sigma.
 LIKELY = 0.3
 # So much must each further coefficient lower chi-square: the Akaike criterion, and twice that for coefficients whose
@@ -66,12 +62,24 @@ def widened(psf: Psf, x: np.ndarray, y: np.ndarray, ratio: np.ndarray, weight: n
     ratio   (N, 2, 2): the stars' covariances along the axes of psf
     weight  (N,) inverse variances of ratio, in any unit
     """
-    # pairs are wide but say nothing about the optics
-    found = fit_field_robustly(psf.monomials(x, y), ratio.reshape(-1, 4), weight, OUTLYING, PLACES, 4)
-    if found is None:
-        return psf
-    fitted, before, after, count = found
-    if (before - after) / (MONOMIALS - 1) < SIGNIFICANT * after / (count - MONOMIALS):
+    field, own, kept = psf.monomials(x, y), ratio.reshape(-1, 4), np.ones(len(x), bool)
+    for _ in range(FIELD_ROUNDS):
+        if np.count_nonzero(kept) < PLACES:
+            return psf
+        weighted = field.T * (weight * kept)
+        normal = weighted @ field
+        # what the places do not tell, as on a line, is 0
+        normal.flat[:: MONOMIALS + 1] += 1e-12 * normal.trace()
+        fitted = np.linalg.solve(normal, weighted @ own)
+        off, those = np.sqrt(weight) * np.abs(own - field @ fitted).max(1), kept
+        # pairs are wide but say nothing about the optics
+        kept = off < OUTLYING * median(off)
+        if (kept == those).all():
+            break
+    own, field, weight = own[kept], field[kept], weight[kept]
+    mean = weight @ own / weight.sum()
+    before, after = (weight @ ((own - model) ** 2).sum(1) for model in (mean, field @ fitted))
+    if (before - after) / (MONOMIALS - 1) < SIGNIFICANT * after / (len(own) - MONOMIALS):
         return psf
     return psf.with_widths(fitted.reshape(-1, 2, 2))
 
@@ -141,12 +149,11 @@ def refine(psf: Psf, stamps: Stamps, fit: Fit, response: Response, terms: Terms)
     """
     local = psf.at(fit.x, fit.y)
     # 2 % of the model as extra noise: the brightest star must not be the only teacher
-    brightness, weight = unit_light(
-        stamps.signal, stamps.noise, stamps.phase, fit.model, fit.used, fit.flux, fit.gains, response.dn_per_photon,
-        response.misfit**2 + 0.02**2,
-    )  # fmt: skip
+    noisier = replace(response, misfit=math.hypot(response.misfit, 0.02))
+    scale = gains_at(fit.gains, stamps.phase) * fit.flux.astype(np.float32)[:, None, None]
+    weight = fit.used * scale**2 / noisier.variance(stamps.noise, fit.model)
     normal, right = marginal_equations(
-        local.axes, local.series, *stamps.corner(fit.x, fit.y), brightness, weight, stamps.phase,
+        local.axes, local.series, *stamps.corner(fit.x, fit.y), stamps.signal / scale, weight, stamps.phase,
         len(response.gain), terms.orders,
     )  # fmt: skip
     count, places = terms.candidates.shape[1:]
@@ -154,12 +161,8 @@ def refine(psf: Psf, stamps: Stamps, fit: Fit, response: Response, terms: Terms)
     each = (field[:, :, None] * field[:, None]).reshape(len(field), -1).T @ normal.reshape(len(field), -1)
     normal = each.reshape(places, places, count, count).transpose(2, 0, 3, 1).reshape(count * places, -1)
     right = (right.T @ field).ravel()
-    candidates = terms.candidates.reshape(-1, len(right)).view(np.uint8)
     normal.flat[:: len(right) + 1] += LIKELY**-2
-    found = choose_terms(normal, right, candidates, terms.price.ravel())
-    if not np.isfinite(found).all():
-        return psf
-    found = found.reshape(count, places)
+    found = _worthy(normal, right, terms).reshape(count, places)
     if places > 1:
         psf, found = _absorbed(psf, field, terms, found)
     used = found.any(1)
@@ -169,6 +172,20 @@ def refine(psf: Psf, stamps: Stamps, fit: Fit, response: Response, terms: Terms)
     series[0, 0, 0] = 1
     series[:, i[1:], j[1:]] = found[used, : len(series)].T
     return replace(psf, series=series)
+
+
+def _worthy(normal: np.ndarray, right: np.ndarray, terms: Terms) -> np.ndarray:
+    """The coefficients (M,) that minimise chi-square, by its normal equations, plus their price; 0 for others."""
+    found, taken, best, price = np.zeros(len(right)), np.zeros(len(right), bool), 0.0, terms.price.ravel()
+    for candidate in terms.candidates.reshape(-1, len(right)):
+        index = (taken | candidate).nonzero()[0]
+        _, solution, failed = lapack.dposv(normal[index][:, index], right[index])
+        gain = right[index] @ solution - price[index].sum()
+        if not failed and gain > best:
+            best, taken = gain, taken | candidate
+            found = np.zeros(len(right))
+            found[index] = solution
+    return found
 
 
 def _absorbed(psf: Psf, field: np.ndarray, terms: Terms, found: np.ndarray) -> tuple[Psf, np.ndarray]:
@@ -200,6 +217,9 @@ TEACHING_PIXELS = 12000
 UNLIKE, DARKEST = 0.005, 1e-9
 # Rounds in which each star's own shape is measured, and in each of them rounds of centring.
 OWN_ROUNDS, CENTRINGS = 3, 2
+# Rounds in which one window is fitted to all, from this sigma (px) where none has a shape; the least squared width (px2)
+# of an image through it.
+COMMON_ROUNDS, FIRST_SIGMA, THINNEST = 4, 1.5, 0.1
 # Number of stars that agree by more than chance, and their maximum difference (log of width, ellipticity); twigs differ.
 ALIKE, LIKENESS = 5, 0.6
 # Rounds of fitting and refining the PSF, and the order of its terms.
@@ -247,9 +267,10 @@ def learn(sky: SkyPlane, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Le
         if not sound.any():
             break
         # two stars in one image would teach a wrong PSF and too much photon noise
-        strange, error = strangeness(stamps.noise, fit.model, fit.residual, fit.used, fit.leverage, DARKEST)
+        strange, error = _strangeness(stamps, fit)
         # compared with the best 30 %, because most of the brightest may be pairs
-        sound &= strange < 3 * max(0, quantile(strange[sound], 0.3)) + 3 * error + UNLIKE
+        usual = np.sort(strange[sound])[int(0.3 * np.count_nonzero(sound))]
+        sound &= strange < 3 * max(0, usual) + 3 * error + UNLIKE
         stamps, fit = stamps.select(sound), fit.select(sound)
         x, y = fit.x, fit.y
         response = respond(stamps, psf, fit, response)
@@ -264,6 +285,16 @@ def learn(sky: SkyPlane, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Le
             terms = even_terms(elongation(psf), RING_ORDER if ring else ORDER)
         psf = refine(psf, stamps, fit, response, terms)
     return Lesson(psf, response, reach_of(psf))
+
+
+def _strangeness(stamps: Stamps, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """The residuals' squared light beyond the sky's noise over the model's, (N,), and its error (N,)."""
+    noise2, light2, left = (
+        np.where(fit.used, image, 0) ** 2 for image in (stamps.noise, fit.model, fit.residual)
+    )
+    light2 = np.maximum(light2.sum((1, 2)), DARKEST)
+    beyond = (left - noise2 * (1 - fit.leverage)).sum((1, 2))
+    return beyond / light2, np.sqrt(2 * (noise2**2).sum((1, 2))) / light2
 
 
 def _teachers(
@@ -281,13 +312,10 @@ def _teachers(
     around = cut(sky, x[bright], y[bright], SIGHT)
     light, full = around.signal, np.any(around.full, axis=(1, 2))
     # the shapes of fainter stars are noise
-    clearly_many = np.count_nonzero(height[bright] > BRIGHT) > ALIKE
-    bright, light = bright[~full], _select_light(light, ~full)
-    light, blur = grey(light, sky)
-    if clearly_many and len(bright):
-        alike = _most_alike(light)
-        bright, light = bright[alike], _select_light(light, alike)
-    shape = frame_shape(light, blur) if len(bright) else None
+    clearly_many = bool(np.count_nonzero(height[bright] > BRIGHT) > ALIKE)
+    bright, (light, blur) = bright[~full], grey(light if not full.any() else light[~full], sky)
+    shape, alike = _typical_shape(light, blur, clearly_many)
+    bright = bright[alike]
     # a shape as wide as the stamps is the sky's
     if shape is not None and squared_widths(shape)[0, 0] > 0.9 * (SIGHT / 2) ** 2:
         shape = None
@@ -340,32 +368,39 @@ def _likeliest(stamps: Stamps, shape: np.ndarray | None, response: Response) -> 
     return choices[0 if learnt else best], learnt
 
 
-def _select_light(light: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """The signals (N, S, S) that a mask (N,) selects; if it selects all, nothing is copied."""
-    return light if which.all() else light[which]
+def _typical_shape(light: np.ndarray, blur: float, many: bool) -> tuple[np.ndarray | None, np.ndarray]:
+    """The covariance (1, 2, 2) px2 of most stars, signals (N, S, S), and which have similar shapes, (N,) bool.
 
-
-def _most_alike(light: np.ndarray) -> np.ndarray:
-    """Select the signals (N, S, S), (N,) bool, with similar shapes, as stars have and twigs have not.
-
-    All of them if most lie near the median shape, else those near the shape at which they are densest.
+    Stars have, and twigs have not: of many stars, those are left out that lie far from the median shape, or, if most
+    do, from the shape at which they are densest. blur, px2, is what smoothing added. None if no star can be measured.
     """
     reach = light.shape[1] // 2
-    widest = (reach / 2) ** 2
+    widest, alike = (reach / 2) ** 2, np.ones(len(light), bool)
     shape, values = own_shapes(
         light, (reach / 4) ** 2, NARROWEST_WINDOW, NARROWEST, widest, OWN_ROUNDS, CENTRINGS, FARTHEST
     )
-    xx, xy, yy = (shape[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    look = np.stack([np.log(xx + yy) / 2, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)])
-    off = look - np.array([[median(kind)] for kind in look])
-    alike = (off**2).sum(0) < LIKENESS**2
-    look = look.T
-    alike &= values[:, 0] > NARROWEST
     sound = (values[:, 0] > NARROWEST) & (values[:, 1] < widest)
-    if np.count_nonzero(alike) > 0.5 * len(alike) or np.count_nonzero(sound) < ALIKE:
-        return np.ones(len(alike), bool)
-    densest = np.argmin(spatial.cKDTree(look[sound]).query(look[sound], ALIKE)[0][:, -1])
-    return sound & (np.linalg.norm(look - look[sound][densest], axis=1) < LIKENESS)
+    if many and np.count_nonzero(sound) >= ALIKE:
+        xx, xy, yy = (shape[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        look = np.stack([np.log(xx + yy) / 2, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)], 1)
+        near = np.linalg.norm(look - np.median(look, axis=0), axis=1) < LIKENESS
+        if np.count_nonzero(near & (values[:, 0] > NARROWEST)) <= 0.5 * len(light):
+            densest = np.argmin(spatial.cKDTree(look[sound]).query(look[sound], ALIKE)[0][:, -1])
+            alike = sound & (np.linalg.norm(look - look[sound][densest], axis=1) < LIKENESS)
+    typical, middle = np.eye(2)[None] * FIRST_SIGMA**2, np.full(len(light), reach)
+    if (sound & alike).any():
+        typical = np.median(shape[sound & alike], axis=0)[None]
+    # faint stars' own windows follow their noise: once more through one window of the shape that all have
+    for _ in range(COMMON_ROUNDS):
+        window = window_for(typical)
+        x, y = centroid(light, middle, middle, typical)
+        seen = window_moments(light, -x, -y, window)[2]
+        usable = alike & (squared_widths(seen)[:, 0] > THINNEST)
+        if not usable.any():
+            return None, alike
+        over = np.linalg.inv(np.median(seen[usable], axis=0)) - np.linalg.inv(window)
+        typical = clip_widths(over, 1 / widest, 1 / NARROWEST, -1.0)
+    return clip_widths(typical - blur * np.eye(2), NARROWEST, np.inf, 1.0), alike
 
 
 def reach_of(psf: Psf) -> int:
@@ -382,7 +417,7 @@ def grey(signal: np.ndarray, sky: SkyPlane) -> tuple[np.ndarray, float]:
 
 def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which peaks (N,) have no neighbour in SIGHT above a fiftieth of their height, and which have no higher one."""
-    pairs = near_pairs(x.astype(float), y.astype(float), SIGHT)
+    pairs = spatial.cKDTree(np.stack([x, y], 1)).query_pairs(SIGHT, output_type="ndarray")
     alone, high = np.ones((2, len(x)), bool)
     for a, b in (pairs.T, pairs.T[::-1]):
         alone[a[height[b] > 0.02 * height[a]]] = False
@@ -407,9 +442,22 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
 
     value (N, S, S): the PSF at the stars' pixels.
     """
-    own, information = phase_fluxes(
-        stamps.signal, stamps.noise, stamps.good, stamps.phase, value, before.dn_per_photon, before.misfit,
-        len(before.gain),
-    )  # fmt: skip
-    gain, spread = typical_gains(own, information, DARKEST_MEAN, MIN_GAIN, OUTLYING_GAIN, GAIN_ROUNDS)
-    return gain, float(np.clip(spread, *SPREADS))
+    weight = stamps.good * value / before.variance(stamps.noise, stamps.signal)
+    phases = len(before.gain)
+    of_phase = (phases * np.arange(len(value))[:, None, None] + stamps.phase).ravel()
+    light, information = (
+        np.bincount(of_phase, (weight * v).ravel(), phases * len(value)).reshape(-1, phases)
+        for v in (stamps.signal, value)
+    )
+    # of each phase its light by the PSF over the star's mean, and its variance
+    flux: np.ndarray = light / np.maximum(information, 1e-12)
+    mean = np.maximum(flux.mean(1, keepdims=True), DARKEST_MEAN)
+    own, error2 = flux / mean, 1 / np.maximum(information * mean**2, 1e-12)
+    gain, spread2 = np.median(own, axis=0), 0.0
+    for _ in range(GAIN_ROUNDS):
+        weight = 1 / (error2 + spread2 + 1e-6)
+        weight *= (own - gain) ** 2 * weight < OUTLYING_GAIN**2
+        gain = np.maximum((weight * own).sum(0) / np.maximum(weight.sum(0), 1e-12), MIN_GAIN)
+        gain /= gain.mean()
+        spread2 = max(0.0, (weight * ((own / gain - 1) ** 2 - error2)).sum() / max(weight.sum(), 1e-12))
+    return gain, float(np.clip(np.sqrt(spread2), *SPREADS))

@@ -174,8 +174,8 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
     cv2.setNumThreads(settings.threads)
     plane, mosaic = plane_of(frame)
     picture = _Picture(plane=plane, mosaic=mosaic, settings=settings, exposure=frame, halvings=MAX_HALVINGS)
-    found = _detect(picture)
-    return replace(found, stars=replace(found.stars, disc=find_disc(plane)))
+    found, disc = _detect(picture), find_disc(plane)
+    return found if disc is None else replace(found, stars=replace(found.stars, disc=disc))
 
 
 def _detect(picture: _Picture) -> Detection:

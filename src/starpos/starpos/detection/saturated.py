@@ -3,9 +3,9 @@
 
 import cv2
 import numpy as np
+from scipy import spatial
 
-from starpos.detection._neighbours import any_near
-from starpos.detection._pixels import bright_squares, third_highest
+from starpos.detection._pixels import third_highest
 from starpos.detection.background import SkyPlane
 from starpos.detection.vet import MEASURED
 from starpos.frames.frame import SATURATED
@@ -38,7 +38,10 @@ def find_discs(sky: SkyPlane, fwhm_px: float, highest: np.ndarray) -> tuple[np.n
     # any disc of this radius has a sample whose neighbours to the right, below and between lie on it too
     step = int(np.sqrt(2) * (least - np.sqrt(0.5)))
     # no single hot pixel
-    y, x, height = bright_squares(sky.plane, highest, step, int(level + CLEAR * noise))
+    lit = np.flatnonzero(highest[:-1:step] > level + CLEAR * noise) * step
+    y, x = np.nonzero(sky.plane[lit, :-1:step] > level + CLEAR * noise)
+    y, x = lit[y], x * step
+    height = np.min([sky.plane[y + down, x + right] for down, right in np.ndindex(2, 2)], axis=0)
     if height.max(initial=0) < level + CLEAR * noise:
         return measured_discs([], fwhm_px, 0.0)
     top = float(height.max())
@@ -175,15 +178,10 @@ def with_clipped(
     level, top = sky.near(x, y)[0].mean(1), third_highest(sky.plane, x, y, 1)[0]
     typical = sky.typical[0]
     lost = top - typical > FLAT * (top.max() - typical)
-    at_x, at_y, own_x, own_y, weak = (
-        x.astype(float),
-        y.astype(float),
-        stars["x"],
-        stars["y"],
-        saturated & ~constrained,
-    )
-    lost[lost] = ~any_near(own_x[constrained], own_y[constrained], at_x[lost], at_y[lost], NEAR)
-    lost |= any_near(own_x[weak], own_y[weak], at_x, at_y, NEAR)
+    peaks, own = np.stack([x, y], 1), np.stack([stars["x"], stars["y"]], 1)
+    lost[lost] = ~_any_near(own[constrained], peaks[lost])
+    if (saturated & ~constrained).any():
+        lost |= _any_near(own[saturated & ~constrained], peaks)
     # what stands on a roof is the roof's
     lost = (lost & (top - level > OWN * (top - typical))).nonzero()[0][:MOST]
     reach = max(MIN_REACH, round(REACH * fwhm_px))
@@ -196,9 +194,14 @@ def with_clipped(
     if not clipped:
         return stars
     discs, radius = measured_discs(clipped, fwhm_px, float(top.max()) - typical)
-    apart = np.hypot(own_x[:, None] - discs["x"], own_y[:, None] - discs["y"])
+    apart = np.hypot(stars["x"][:, None] - discs["x"], stars["y"][:, None] - discs["y"])
     known = constrained | ~(apart < radius).any(1)
     return with_discs(stars[known], discs, radius, fwhm_px)
+
+
+def _any_near(points: np.ndarray, to: np.ndarray) -> np.ndarray:
+    """Whether one of the points (N, 2) is NEAR each of others (M, 2): (M,) bool."""
+    return spatial.cKDTree(points).query(to, distance_upper_bound=NEAR)[0] < NEAR
 
 
 def _image(

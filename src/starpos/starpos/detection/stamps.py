@@ -7,14 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from starpos.detection._moments import (
-    centroids,
-    clip_widths,
-    invert_shapes,
-    through_window,
-    typical_shape,
-    width_ratios,
-)
+from starpos.detection._moments import centroids, clip_widths
 from starpos.detection._pixels import cut_stamps, measure_rims, sum_squares
 from starpos.detection.background import SkyPlane
 from starpos.units import SIGMA_PER_MAD
@@ -135,9 +128,6 @@ def surroundings(sky: SkyPlane, x: np.ndarray, y: np.ndarray, reach: int) -> tup
 NARROWEST = 0.2
 # px2. Through a narrower window a sum over pixels is too far from the integral.
 NARROWEST_WINDOW = 1.2
-# A star counts for the typical shape if its mean is so near the peak, px, and its windowed image wider than that, px2;
-# which is settled at a relative change of so little.
-NEAR, THINNEST, SETTLED = 1.5, 0.1, 1e-3
 # Maximum distance of a centroid from the peak, px, and the number of rounds.
 FARTHEST, ROUNDS = 2.0, 3
 
@@ -152,33 +142,4 @@ def centroid(signal: np.ndarray, x: np.ndarray, y: np.ndarray, shape: np.ndarray
 
     signal (N, S, S): of stamps around the pixels x, y (N,) int.
     """
-    window = window_for(shape)
-    # through the window an offset looks smaller than it is
-    gain = np.eye(2) + shape @ invert_shapes(window)
-    return centroids(signal, x, y, window, gain, ROUNDS, FARTHEST)
-
-
-def frame_shape(signal: np.ndarray, blur: float = 0.0, rounds: int = 12) -> np.ndarray | None:
-    """The typical covariance C (1, 2, 2) px2 of stars, signals (N, S, S), measured through a window of the same shape.
-
-    blur, px2, is what smoothing added to their covariance. None if no star can be measured.
-    """
-    # a wide window suits all stars, but in the noise of a wide window faint sharp ones are lost
-    reach = signal.shape[1] // 2
-    for width in (max(1.5, reach / 4), 1.5):
-        # a stamp does not hold a wider star than half its reach
-        shape = typical_shape(
-            signal, width**2, NARROWEST_WINDOW, NARROWEST, (reach / 2) ** 2, rounds, NEAR, THINNEST, SETTLED
-        )  # fmt: skip
-        if shape is not None:
-            return clip_widths(shape[None] - blur * np.eye(2), NARROWEST, np.inf, 1.0)
-    return None
-
-
-def relative_widths(seen: np.ndarray, shape: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """The smaller and the larger squared width (N, 2) of images through windows, over the widths of stars of this shape.
-
-    Both are 1 for a star of that shape and near 0 for a hot pixel. Along a streak the larger reaches 2 if the window is
-    the shape. NaN counts as 0.
-    """
-    return width_ratios(seen, through_window(shape, window))
+    return centroids(signal, x, y, shape, NARROWEST_WINDOW, ROUNDS, FARTHEST)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy import ndimage, optimize, special
 
-from starpos.detection.background import SkyPlane, measure_sky, plane_of
+from starpos.detection.background import SkyPlane, between, measure_sky, plane_of
 from starpos.detection.pipeline import DetectionSettings
 from starpos.detection.second_look import FWHM_PER_SIGMA, negative_of
 from starpos.frames.frame import Frame, FrameTrail, Stars
@@ -88,24 +88,11 @@ def _light_of(sky: SkyPlane, x: np.ndarray, y: np.ndarray, flux: np.ndarray, sig
     """The plane (h, w) float32 above the sky, in sigma of its noise; NaN where it is saturated, or a star's."""
     light = sky.plane.astype(np.float32)
     height, width = light.shape
+    step = 2 if sky.is_mosaic else 1
     for phase in range(len(sky.level)):
-        step = 2 if sky.is_mosaic else 1
         part = np.s_[phase // 2 :: step, phase % 2 :: step]
-        rows, columns = light[part].shape
-        (top, down), (left, across) = (
-            (float(first), float(second - first) * step)
-            for first, second in (
-                (sky.cell(0, phase // 2)[0], sky.cell(0, phase // 2 + 1)[0]),
-                (sky.cell(phase % 2, 0)[1], sky.cell(phase % 2 + 1, 0)[1]),
-            )
-        )
-        way = np.array([[across, 0, left], [0, down, top]])
-        level, noise = (
-            cv2.warpAffine(
-                mesh.astype(np.float32), way, (columns, rows), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            )
-            for mesh in (sky.level[phase], sky.noise[phase])
-        )
+        cell = sky.cell(np.arange(width)[part[1]], np.arange(height)[part[0]])
+        level, noise = (between(mesh[phase].astype(np.float32), *cell) for mesh in (sky.level, sky.noise))
         light[part] = (light[part] - level) / noise
     # columns and rows of the sensor that differ a little are no trails
     for axis, some in ((0, light[::4]), (1, light[:, ::4])):

@@ -5,16 +5,10 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from scipy import spatial
 
-from starpos.detection._moments import squared_widths, window_moments
-from starpos.detection._neighbours import near_pairs
-from starpos.detection._vetting import (
-    compare_with_pixel,
-    correct_sky,
-    describe_stars,
-    replace_spikes,
-    restore_model,
-)
+from starpos.detection._moments import relative_widths, squared_widths, window_moments
+from starpos.detection._vetting import compare_with_pixel, correct_sky, replace_spikes
 from starpos.detection.background import SkyPlane
 from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars, split_pairs, surprising
 from starpos.detection.learn import Lesson, grey
@@ -26,7 +20,6 @@ from starpos.detection.stamps import (
     centroid,
     cut,
     joined,
-    relative_widths,
     window_for,
 )
 from starpos.frames.frame import BLENDED, EDGE, ELONGATED, SATURATED
@@ -118,20 +111,15 @@ def measure(
 def _measured(
     stamps: Stamps, fit: Fit, sky: SkyPlane, lesson: Lesson, min_snr: float, wanted: np.ndarray
 ) -> np.ndarray:
-    """The fitted stars as `measure` gives them, of those that are wanted (N,) and are stars.
-
-    The stamps' light is changed.
-    """
+    """The fitted stars as `measure` gives them, of those that are wanted (N,) and are stars."""
     psf = lesson.psf
     local = psf.at(fit.x, fit.y)
     corner = stamps.corner(fit.x, fit.y)
-    matched, foreign, full, edge = describe_stars(
-        stamps.signal, stamps.noise, stamps.good, stamps.full, stamps.spike, fit.residual, fit.model, fit.used,
-        fit.outlier, *corner, local.axes, *CORE,
-    )  # fmt: skip
+    matched = fit.sky_snr
+    full = _any_within(stamps.full, *corner, local.axes, CORE[0])
+    edge = _any_within(~(stamps.good | stamps.full | stamps.spike), *corner, local.axes, CORE[1])
     dot = _is_dot(stamps, fit, lesson.response)
-    restore_model(stamps.signal, stamps.noise, stamps.spike, fit.model, fit.outlier, SPECK, LOUD)
-    smooth, blur = grey(stamps.signal, sky)
+    smooth, blur = grey(_own_light(stamps, fit, bool(sky.streaks)), sky)
     shape = psf.shapes_at(stamps.x, stamps.y)
     window = window_for(shape)
     _, _, seen = window_moments(smooth, *corner, window)
@@ -151,7 +139,7 @@ def _measured(
         wide = (widths[:, 1] > WIDE + loose - slack) & ~full
         sound &= full | (widths[:, 0] > 0.45 - loose)
         sound &= ~wide | ((widths[:, 0] < NARROW) & (matched > CERTAIN))
-        blended = (foreign > 0.05 * fit.flux) | (misfit > STRANGE) | wide
+        blended = (fit.foreign > 0.05 * fit.flux) | (misfit > STRANGE) | wide
         elongated = (widths[:, 1] / np.maximum(widths[:, 0], 0.1) > 1.35 + slack) & ~full & ~edge
     flags = SATURATED * full + EDGE * edge + ELONGATED * elongated + BLENDED * blended
     rows = np.empty(np.count_nonzero(sound), MEASURED)
@@ -167,6 +155,36 @@ def _measured(
     ):
         rows[name] = column[sound]
     return rows
+
+
+def _any_within(
+    pixels: np.ndarray, left: np.ndarray, top: np.ndarray, axes: np.ndarray, widths: float
+) -> np.ndarray:
+    """Whether one of the pixels, (N, S, S) bool, lies within so many widths of the PSF from its star: (N,) bool.
+
+    left, top (N,) px: first column and row of a stamp, from the centre of the star; axes: as in LocalPsf.
+    """
+    if not pixels.any():
+        return np.zeros(len(pixels), bool)
+    star, row, column = pixels.nonzero()
+    apart = np.stack([left[star] + column, top[star] + row], 1)
+    axes = np.broadcast_to(axes, (len(pixels), 2, 2))[star]
+    found = np.zeros(len(pixels), bool)
+    found[star[np.linalg.norm(np.einsum("nij,nj->ni", axes, apart), axis=1) < widths]] = True
+    return found
+
+
+def _own_light(stamps: Stamps, fit: Fit, streaked: bool) -> np.ndarray:
+    """The signals (N, S, S) with the model in pixels that say nothing about the star's own shape.
+
+    These are spikes, a SPECK of outliers, and those that streaks make loud.
+    """
+    lost = stamps.spike | fit.outlier
+    if fit.outlier.any():
+        lost &= (np.count_nonzero(fit.outlier, axis=(1, 2)) <= SPECK)[:, None, None] | stamps.spike
+    if streaked:
+        lost |= stamps.noise > LOUD * stamps.noise.min((1, 2), keepdims=True)
+    return np.where(lost, fit.model, stamps.signal) if lost.any() else stamps.signal
 
 
 def _misfit(fit: Fit) -> np.ndarray:
@@ -212,7 +230,7 @@ def resolve(stars: np.ndarray, psf: Psf) -> np.ndarray:
     # in widths of the PSF
     points = np.stack([stars["x"], stars["y"]], 1) @ psf.axes.T
     # the brighter star of each pair first
-    pairs = near_pairs(*np.ascontiguousarray(points.T), FAR)
+    pairs = spatial.cKDTree(points).query_pairs(FAR, output_type="ndarray")
     apart = np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T)
     ratio = stars["flux"][pairs[:, 1]] / stars["flux"][pairs[:, 0]]
     keep = np.ones(len(stars), bool)

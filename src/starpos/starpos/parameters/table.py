@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from starpos.errors import StarposError
-from starpos.files import LONGEST_PATH
+from starpos.files import LONGEST_PATH, rows_of
 
 NODES = ("camera", "detector", "inclinometer", "solver", "navigator", "dashboard")
 # Characters of a text, as of a path. Nothing else limits what a caller may send.
@@ -159,17 +159,6 @@ def parameters_of(node: str) -> tuple[Parameter, ...]:
     """
     rows = rows_of(Path(__file__).with_name("data") / f"{node}.yaml")
     return tuple(_parameter(name, row) for name, row in rows.items())
-
-
-@cache
-def rows_of(file: Path) -> dict[str, Any]:
-    """The rows of a YAML file of a package."""
-    import yaml
-
-    # PyYAML's parser in C takes a tenth of the time; a build without it is rare
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    rows: dict[str, Any] = yaml.load(file.read_bytes(), loader)
-    return rows
 
 
 def defaults_of(node: str) -> dict[str, Any]:

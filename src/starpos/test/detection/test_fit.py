@@ -124,7 +124,7 @@ def rules(gain, settled=0.0):
 def fit_singles(signal, noise, good, phase, column, row, x, y, *given):
     """The columns of single stars."""
     columns = fit_stamps(signal, noise, good, phase, column, row, x[None], y[None], *given)
-    return tuple(c[0] if k in (*range(6), 9) else c for k, c in enumerate(columns))
+    return tuple(c[0] if k in (*range(6), 9, 13) else c for k, c in enumerate(columns))
 
 
 @pytest.mark.parametrize("gain", [np.ones(1), np.array([0.7, 1.1, 1.2, 1.0])], ids=["grey", "mosaic"])
@@ -135,8 +135,11 @@ def test_fit_is_that_of_plain_sums(gain, rounds, rng):
     found, expected = fit_singles(*given, rules(gain), rounds, True, True), plain_fit(*given, gain, rounds)
     for column, plain in zip(found[:7], expected[:7], strict=True):
         np.testing.assert_allclose(column, plain, rtol=1e-9, atol=1e-9)
-    for image, plain in zip(found[8:], expected[7:], strict=True):
+    for image, plain in zip(found[8:13], expected[7:], strict=True):
         np.testing.assert_allclose(image, plain, rtol=1e-5, atol=1e-3)
+    residual, model, used, outlier, _, snr, foreign = found[8:]
+    np.testing.assert_allclose(snr, np.sqrt((used * (model / given[1]) ** 2).sum((1, 2))), rtol=1e-5)
+    np.testing.assert_allclose(foreign, (outlier * np.maximum(residual, 0)).sum((1, 2)), rtol=1e-5)
     assert expected[10][1].any() == (rounds > 2)
     assert not fit_singles(*given, rules(gain), rounds, False, True)[12].size
 

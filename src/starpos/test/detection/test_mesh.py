@@ -6,39 +6,40 @@ import pytest
 from scipy import ndimage
 
 from starpos.detection._peaks import find_maxima, smooth_rows
-from starpos.detection._pixels import any_flat, bright_squares, third_highest
-from starpos.detection._sky import even_out, interpolated, median, quantile, scores, sky_at
+from starpos.detection._pixels import any_flat, third_highest
+from starpos.detection._sky import median, sky_at
+from starpos.detection.background import _evened, between
 from starpos.detection.finding import SHARP, WIDE
 
 
-def plain_evened(mesh, steep, level):
-    """A mesh (rows, columns), evened out by scipy."""
-    around = np.pad(mesh, 2, "reflect", reflect_type="odd")
-    typical = ndimage.median_filter(around, 3)
-    even, typical = ndimage.uniform_filter(typical, 3)[2:-2, 2:-2], typical[2:-2, 2:-2]
-    mesh = np.where(np.abs(even - typical) < steep, even, typical)
-    return np.pad(mesh, 1, "edge") if level else np.pad(mesh, 1, "reflect", reflect_type="odd")
+def continued(mesh, cells):
+    """A mesh whose gradient goes on."""
+    return np.pad(mesh, cells, "reflect", reflect_type="odd")
 
 
-@pytest.mark.parametrize("level", [False, True])
+@pytest.mark.parametrize("goes_on", [False, True])
+@pytest.mark.parametrize("steep", [0.0, 0.3, 9.0])
 @pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1), (2, 2), (3, 5), (18, 27)])
-def test_a_mesh_is_evened_as_by_filters(size, level, rng):
-    mesh, steep = rng.normal(0, 1, (3, *size)), np.array([0.0, 0.3, 9.0])
-    plain = [plain_evened(m, s, level) for m, s in zip(mesh, steep, strict=True)]
-    np.testing.assert_allclose(even_out(mesh, steep, level), plain, rtol=1e-12, atol=1e-12)
+def test_a_mesh_is_evened_as_by_filters(size, steep, goes_on, rng):
+    mesh = rng.normal(60000, 1, size)
+    typical = ndimage.median_filter(continued(mesh, 2), 3)
+    even, typical = ndimage.uniform_filter(typical, 3)[2:-2, 2:-2], typical[2:-2, 2:-2]
+    plain = np.where(np.abs(even - typical) < steep, even, typical)
+    plain = continued(plain, 1) if goes_on else np.pad(plain, 1, "edge")
+    np.testing.assert_allclose(_evened(mesh, steep, goes_on), plain, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("phases", [1, 4])
-def test_scores_are_those_of_single_places(phases, rng):
-    level, noise = rng.uniform(5, 9, (2, phases, 4, 6))
-    row, column = np.sort(rng.uniform(0, 2.99, 7)), np.sort(rng.uniform(0, 4.99, 11))
-    value = rng.normal(0, 100, (7, 11)).astype(np.float32)
-    places = [v.ravel() for v in np.meshgrid(row, column, indexing="ij")]
-    sky, sigma = interpolated(level, *places).mean(1), np.sqrt((interpolated(noise, *places) ** 2).mean(1))
-    plain = ((value.ravel() - sky) / sigma).reshape(value.shape)
-    np.testing.assert_allclose(scores(value, level, noise, row, column), plain, rtol=1e-5)
-    with pytest.raises(ValueError, match="a mesh of 4"):
-        scores(value, level, noise, row + 1, column)
+def test_a_gradient_of_a_mesh_goes_on_beyond_its_edges():
+    row, column = np.mgrid[-1:8, -1:6]
+    plane = 500.0 + 3 * row - 2 * column
+    np.testing.assert_allclose(_evened(plane[1:-1, 1:-1], 9.0, True), plane, rtol=0, atol=1e-4)
+
+
+def test_a_mesh_is_linear_between_its_cells(rng):
+    mesh = rng.normal(0, 1, (5, 8))
+    rows, columns = rng.uniform(0, 3.99, 9), rng.uniform(0, 6.99, 11)
+    plain = ndimage.map_coordinates(mesh, np.meshgrid(rows, columns, indexing="ij"), order=1)
+    np.testing.assert_allclose(between(mesh, rows, columns), plain, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
@@ -54,26 +55,6 @@ def test_some_rows_are_smoothed_as_by_convolution(kind, rng):
         smooth_rows(plane, weight, rows + 1, 4)
 
 
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-@pytest.mark.parametrize("step", [1, 3, 4])
-def test_bright_squares_are_those_of_slices(kind, step, rng):
-    plane = rng.integers(0, 200, (41, 34)).astype(kind)
-    # most rows have nothing
-    plane[rng.random(41) < 0.7] = 3
-    row, column = np.nonzero(plane[:-1:step, :-1:step] > 120)
-    row, column = row * step, column * step
-    low = np.min([plane[row + i, column + j] for i in (0, 1) for j in (0, 1)], axis=0)
-    squares = bright_squares(plane, plane.max(1).astype(np.int32), step, 120)
-    for found, plain in zip(squares, (row, column, low), strict=True):
-        np.testing.assert_array_equal(found, plain)
-
-
-def test_a_frame_of_one_row_has_no_squares():
-    assert not any(
-        len(column) for column in bright_squares(np.full((1, 9), 9, np.uint8), np.full(1, 9, np.int32), 2, 1)
-    )
-
-
 def test_flat_blocks_are_found_and_black_ones_are_not(rng):
     plane, some = rng.integers(1, 9, (40, 64)).astype(np.uint8), (np.arange(0, 5, 2), np.arange(1, 8, 2))
     plane[8:16, 24:32], plane[16:24, 24:32] = 7, 0
@@ -87,18 +68,11 @@ def test_flat_blocks_are_found_and_black_ones_are_not(rng):
 
 
 @pytest.mark.parametrize("n", [1, 2, 9, 100])
-def test_medians_and_quantiles_are_those_of_numpy(n, rng):
+def test_medians_are_those_of_numpy(n, rng):
     values = rng.normal(0, 1, n)
     assert median(values) == pytest.approx(np.median(values), abs=1e-15)
-    for share in (0, 0.3, 0.97, 1):
-        assert quantile(values, share) == pytest.approx(np.quantile(values, share), abs=1e-15)
     assert np.isnan(median(np.append(values, np.nan)))
-
-
-def test_nothing_has_no_median_and_no_quantile():
     assert np.isnan(median(np.zeros(0)))
-    with pytest.raises(ValueError, match="there is none"):
-        quantile(np.zeros(0), 0.5)
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
@@ -123,9 +97,12 @@ def test_the_sky_near_a_pixel_lies_between_cells(phases, rng):
     level, noise = rng.uniform(5, 9, (2, phases, 5, 8))
     x, y = rng.integers(-3, 63, 40), rng.integers(-3, 33, 40)
     place = (y + 0.5) * 3 / 30 + 0.5, (x + 0.5) * 6 / 60 + 0.5
-    plain = interpolated(level, *place), interpolated(noise, *place) * 1.5
-    for found, expected in zip(sky_at(level, noise, x, y, 60, 30, 1.5), plain, strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-6)
+    level_there, noise_there = (
+        np.transpose([ndimage.map_coordinates(m, place, order=1, mode="nearest") for m in mesh])
+        for mesh in (level, noise)
+    )
+    found = sky_at(level, noise, x, y, 60, 30, 1.5)
+    np.testing.assert_allclose(found, (level_there, noise_there * 1.5), rtol=1e-6)
     with pytest.raises(ValueError, match="as many"):
         sky_at(level, noise, x, y[1:], 60, 30, 1.5)
     with pytest.raises(ValueError, match="as of level"):

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.detection._learn import light_noise, strangeness, typical_gains
+from starpos.detection._learn import light_noise
 
 N, SIZE = 20, 9
 
@@ -66,46 +66,3 @@ def test_images_of_other_shapes_are_refused(rng):
         light_noise(given[0][1:], *given[1:], 0.0, 0.0, 5.0)
     with pytest.raises(ValueError, match="as many"):
         light_noise(*given[:4], np.zeros((N, 0, 0), np.float32), 0.0, 0.0, 5.0)
-
-
-def test_strangeness_is_that_of_plain_sums(rng):
-    """A star that was not fitted has none, whatever its pixels are."""
-    noise, model, residual, used, leverage = fits(rng, 0.4, 0.02, 1e3)
-    used[3], model[3] = False, np.nan
-    noise2, light = (np.where(used, v.astype(float), 0) ** 2 for v in (noise, model))
-    left = (np.where(used, residual.astype(float), 0) ** 2 - noise2 * (1 - leverage)).sum((1, 2))
-    light2 = np.maximum(light.sum((1, 2)), 1e-9)
-    found = strangeness(noise, model, residual, used, leverage, 1e-9)
-    np.testing.assert_allclose(
-        found, (left / light2, np.sqrt(2 * (noise2**2).sum((1, 2))) / light2), rtol=1e-7
-    )
-    with pytest.raises(ValueError, match="as many"):
-        strangeness(noise[1:], model, residual, used, leverage, 1e-9)
-
-
-def plain_gains(own, information):
-    """Gains of phases and the scatter of single stars' gains about them, all stars at once."""
-    mean = np.maximum(own.mean(1, keepdims=True), 1e-3)
-    own, error2 = own / mean, 1 / np.maximum(information * mean**2, 1e-12)
-    gain, spread2 = np.median(own, 0), 0.0
-    for _ in range(4):
-        weight = 1 / (error2 + spread2 + 1e-6)
-        weight = weight * ((own - gain) ** 2 * weight < 16)
-        gain = np.maximum((weight * own).sum(0) / np.maximum(weight.sum(0), 1e-12), 0.02)
-        gain = gain / gain.mean()
-        spread2 = max(0.0, (weight * ((own / gain - 1) ** 2 - error2)).sum() / max(weight.sum(), 1e-12))
-    return gain, np.sqrt(spread2)
-
-
-@pytest.mark.parametrize("n", [1, 2, 31])
-def test_gains_are_those_of_plain_sums(n, rng):
-    light, gain = rng.uniform(1e3, 1e5, (n, 1)), np.array([0.6, 1.1, 1.2, 1.1])
-    information = 1 / (50 + light * gain)
-    own = light * gain * rng.normal(1, 0.08, (n, 4)) + rng.normal(0, 1, (n, 4)) / np.sqrt(information)
-    own[n // 2, 2] *= 4
-    found, spread = typical_gains(own, information, 1e-3, 0.02, 4.0, 4)
-    expected = plain_gains(own, information)
-    np.testing.assert_allclose(found, expected[0], rtol=1e-11)
-    assert spread == pytest.approx(expected[1], rel=1e-9)
-    if n > 2:
-        np.testing.assert_allclose(found, gain, atol=0.1)

@@ -7,9 +7,7 @@ import pytest
 from starpos.detection._moments import (
     centroids,
     clip_widths,
-    invert_shapes,
     own_shapes,
-    typical_shape,
     window_moments,
     without_window,
 )
@@ -35,35 +33,12 @@ def plain_own_shapes(signal, first, narrowest_window, narrowest, widest):
     middle, shape = np.full(n, half), np.eye(2)[None].repeat(n, 0) * first
     for centrings in (0, 2, 2):
         window = clip_widths(shape, narrowest_window, np.inf, 1.0)
-        x, y = centroids(
-            signal, middle, middle, window, np.eye(2) + shape @ invert_shapes(window), centrings, 2.0
-        )
+        x, y = centroids(signal, middle, middle, shape, narrowest_window, centrings, 2.0)
         own = np.nan_to_num(without_window(window_moments(signal, -x, -y, window)[2], window))
         values, vectors = np.linalg.eigh(own)
         values = np.where(values > 0, np.clip(values, narrowest, widest), widest)
         shape = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
     return shape, values
-
-
-def plain_settled(signal, first, narrowest_window, narrowest, widest):
-    """The typical shape by medians over whole arrays, or None."""
-    half = signal.shape[1] // 2
-    x, y = np.full((2, len(signal)), float(half))
-    window, shape = np.eye(2) * first, None
-    for _ in range(12):
-        _, step, seen = window_moments(signal, -x, -y, window[None])
-        usable = (np.abs(step).max(1) < 1.5) & (np.linalg.eigvalsh(np.nan_to_num(seen))[:, 0] > 0.1)
-        if not usable.any():
-            break
-        of_seen, of_window = invert_shapes(np.stack([np.median(seen[usable], axis=0), window]))
-        own = clip_widths((of_seen - of_window)[None], 1 / widest, 1 / narrowest, -1.0)[0]
-        step = np.where(usable[:, None], step @ (np.eye(2) + own @ of_window).T, 0)
-        x, y = x + np.clip(step[:, 0], -1, 1), y + np.clip(step[:, 1], -1, 1)
-        change = np.inf if shape is None else np.abs(own - shape).max() / own.max()
-        shape, window = own, clip_widths(own[None], narrowest_window, np.inf, 1.0)[0]
-        if change < 1e-3:
-            break
-    return shape
 
 
 def test_own_shapes_are_those_of_windows_that_follow_them(rng):
@@ -76,24 +51,8 @@ def test_own_shapes_are_those_of_windows_that_follow_them(rng):
         np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9)
 
 
-@pytest.mark.parametrize("first", [2.25, 9.0])
-@pytest.mark.parametrize("n", [1, 2, 30])
-def test_the_typical_shape_is_that_of_medians(first, n, rng):
-    for _ in range(20):
-        signal = stars(rng, n)
-        found = typical_shape(signal, first, 1.2, 0.2, 36.0, 12, 1.5, 0.1, 1e-3)
-        plain = plain_settled(signal, first, 1.2, 0.2, 36.0)
-        assert (found is None) == (plain is None)
-        if plain is not None:
-            np.testing.assert_allclose(found, plain, rtol=1e-7)
-
-
-def test_darkness_has_no_typical_shape_and_the_widest_of_its_own():
+def test_darkness_has_the_widest_shape():
     dark = np.zeros((3, 9, 9), np.float32)
-    assert typical_shape(dark, 4.0, 1.2, 0.2, 16.0, 12, 1.5, 0.1, 1e-3) is None
-    assert typical_shape(dark[:0], 4.0, 1.2, 0.2, 16.0, 12, 1.5, 0.1, 1e-3) is None
     np.testing.assert_array_equal(own_shapes(dark, 4.0, 1.2, 0.2, 16.0, 3, 2, 2.0)[1], 16.0)
-    with pytest.raises(ValueError, match="square"):
-        typical_shape(dark[:, :8].copy(), 4.0, 1.2, 0.2, 16.0, 12, 1.5, 0.1, 1e-3)
     with pytest.raises(ValueError, match="square"):
         own_shapes(dark[:, :8].copy(), 4.0, 1.2, 0.2, 16.0, 3, 2, 2.0)

@@ -3,10 +3,9 @@
 
 import numpy as np
 import pytest
-from scipy import ndimage
 
 from starpos.detection._pixels import cut_stamps
-from starpos.detection._sky import interpolated, sample_sky
+from starpos.detection._sky import sample_sky
 from starpos.detection.background import CLIP
 from starpos.units import SIGMA_PER_MAD
 
@@ -35,15 +34,6 @@ def test_cells_are_those_of_sorted_values(kind, rng):
         expected = *plain_cell(values), values.max(), (values == values.max()).sum()
         found = [a[phase, i, j] for a in (level, noise, highest, count)]
         np.testing.assert_allclose(found, expected, rtol=1e-12)
-
-
-def test_between_cells_the_sky_is_linear_and_beyond_them_as_on_the_edge(rng):
-    mesh, (row, column) = rng.normal(0, 1, (3, 5, 7)), rng.uniform(-1, 8, (2, 50))
-    expected = [ndimage.map_coordinates(m, (row, column), order=1, mode="nearest") for m in mesh]
-    np.testing.assert_allclose(
-        interpolated(mesh, row, column), np.transpose(expected), rtol=1e-12, atol=1e-12
-    )
-    assert np.isfinite(interpolated(mesh, np.full(1, np.nan), np.full(1, np.inf))).all()
 
 
 @pytest.mark.parametrize("phases", [1, 4])
@@ -78,8 +68,6 @@ def test_what_lies_beyond_the_frame_is_refused():
         sample_sky(plane, rows, rows, *CLIP)
     with pytest.raises(ValueError, match="pairs"):
         sample_sky(plane, rows[:, :3].copy(), rows, *CLIP)
-    with pytest.raises(ValueError, match="in 2 x 2 or more"):
-        interpolated(np.zeros((1, 1, 5)), np.zeros(3), np.zeros(3))
     with pytest.raises(ValueError, match="phases"):
         cut_stamps(plane, np.zeros(2, int), np.zeros(1, int), 1, *np.zeros((2, 2, 1), np.float32), 1.0)
     with pytest.raises(ValueError, match="nothing to see"):

@@ -5,13 +5,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from starpos.detection._vetting import (
-    compare_with_pixel,
-    correct_sky,
-    describe_stars,
-    replace_spikes,
-    restore_model,
-)
+from starpos.detection._vetting import correct_sky, replace_spikes
 from starpos.units import SIGMA_PER_MAD
 
 N, SIZE = 12, 11
@@ -30,13 +24,6 @@ def stamps(rng):
     phase[:, 1::2] += 2
     phase[:, :, 1::2] += 1
     return signal.astype(np.float32), noise.astype(np.float32), good, full, phase
-
-
-@pytest.fixture
-def fits(rng, stamps):
-    """Residual, model, used and outlier (N, S, S) of a fit."""
-    model = (0.9 * np.maximum(stamps[0], 0)).astype(np.float32)
-    return stamps[0] - model, model, rng.random(model.shape) < 0.5, rng.random(model.shape) < 0.02
 
 
 def test_the_sky_at_the_rims_is_taken_off(stamps):
@@ -80,66 +67,9 @@ def test_spikes_become_the_mean_of_their_neighbours(stamps, rng):
     np.testing.assert_allclose(signal, healed, rtol=1e-6, atol=1e-5)
 
 
-def test_pixels_that_say_nothing_of_the_star_become_its_model(stamps, fits, rng):
-    signal, noise, *_ = stamps
-    _, model, _, outlier = fits
-    noise[3, 4:6] *= 4
-    outlier[5, :2] = True
-    spike = rng.random(signal.shape) < 0.02
-    speck = outlier & (outlier.sum((1, 2)) <= 3)[:, None, None]
-    expected = np.where(speck | spike | (noise > 3 * noise.min((1, 2), keepdims=True)), model, signal)
-    restore_model(signal, noise, spike, model, outlier, 3, 3.0)
-    np.testing.assert_array_equal(signal, expected)
-
-
-@pytest.mark.parametrize("many", [1, N])
-def test_looks_are_those_of_plain_sums(many, stamps, fits, rng):
-    signal, noise, good, full, _ = stamps
-    residual, model, used, outlier = fits
-    spike = ~good & ~full & (rng.random(signal.shape) < 0.5)
-    left, top = -(SIZE // 2) + rng.uniform(-0.5, 0.5, (2, N))
-    axes = np.linalg.inv(rng.normal(0, 0.3, (many, 2, 2)) + 1.5 * np.eye(2))
-    grid = np.arange(SIZE)
-    d = np.stack(np.broadcast_arrays((left[:, None] + grid)[:, None], (top[:, None] + grid)[..., None]), -1)
-    distance = np.linalg.norm(d @ np.swapaxes(axes, 1, 2)[:, None], axis=-1)
-    expected = (
-        np.sqrt(((model / noise) ** 2 * used).sum((1, 2))),
-        (np.maximum(residual, 0) * outlier).sum((1, 2)),
-        (full & (distance < 2)).any((1, 2)),
-        (~good & ~full & ~spike & (distance < 3)).any((1, 2)),
-    )
-    found = describe_stars(
-        signal, noise, good, full, spike, residual, model, used, outlier, left, top, axes, 2.0, 3.0
-    )
-    assert 0 < expected[2].sum() < N
-    for one, plain in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, plain, rtol=1e-5)
-
-
-@pytest.mark.parametrize("half", [0, 3, SIZE // 2])
-def test_one_pixel_is_compared_with_the_star(half, stamps, fits):
-    signal, noise, good, full, _ = stamps
-    residual, model, *_ = fits
-    c = slice(SIZE // 2 - half, SIZE // 2 + half + 1)
-    s, n, g, r, m = (a[:, c, c].astype(float) for a in (signal, noise, good, residual, model))
-    variance = n**2 + 0.4 * m + 0.01**2 * m**2
-    score = g * (s / n) ** 2
-    expected = (
-        score.sum((1, 2)) - (score * (s > 0)).max((1, 2)),
-        (g * (r**2 / variance + np.log(variance / n**2))).sum((1, 2)),
-        g.sum((1, 2)),
-        full[:, c, c].sum((1, 2)),
-    )
-    found = compare_with_pixel(signal, noise, good, full, residual, model, 0.4, 0.01, half)
-    for one, plain in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, plain, rtol=1e-5, atol=1e-5)
-
-
 def test_pixels_of_other_stamps_are_refused(stamps):
-    signal, noise, good, full, phase = stamps
+    signal, noise, good, _, phase = stamps
     with pytest.raises(ValueError, match="stamps"):
         correct_sky(signal, noise[:3].copy(), SIGMA_PER_MAD, 0.6, 1.6, 0.01)
     with pytest.raises(ValueError, match="gains"):
         replace_spikes(signal, noise, good, phase, np.ones(2, np.float32), np.ones(N, np.float32), 6.0)
-    with pytest.raises(ValueError, match="middle"):
-        compare_with_pixel(signal, noise, good, full, signal, signal, 0.4, 0.01, SIZE)
