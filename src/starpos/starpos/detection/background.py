@@ -108,6 +108,8 @@ def _is_white(side: np.ndarray, highest: int) -> bool:
     return bool(np.count_nonzero(side == highest) >= WHITE_SIDE * len(side))
 
 
+# One more cell beyond each edge of a mesh.
+BEYOND = (0, 0), (1, 1), (1, 1)
 # Maximum difference of neighbouring cells of continuous sky, in sigmas of a cell.
 STEEP = 5
 # DN rms. Rounding to whole numbers adds this noise, so no pixel has less.
@@ -214,28 +216,26 @@ def measure_sky(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None = None
     error = np.maximum(noise, QUANTISATION) * samples**-0.5
     # cells that differ by more lie at an edge, of a roof for example
     steep = STEEP * np.array([median(e) for e in error.reshape(len(error), -1)])
-    level, noise = (
-        np.stack([_evened(*one, goes_on) for one in zip(mesh, steep, strict=True)])
-        for mesh, goes_on in ((level, True), (noise, False))
-    )
+    even = _evened(np.concatenate([level, noise]), np.tile(steep, 2))
+    # a gradient of the level goes on beyond the edge
+    level = np.pad(even[: len(level)], BEYOND, "reflect", reflect_type="odd")
+    noise = np.pad(even[len(noise) :], BEYOND, "edge")
     noise = np.maximum(noise, max(QUANTISATION, _lost_noise(plane)))
     return SkyPlane(plane=plane, level=level, noise=noise)
 
 
-def _evened(mesh: np.ndarray, steep: float, goes_on: bool) -> np.ndarray:
-    """A mesh (rows, columns) evened out: (rows + 2, columns + 2), with one more cell beyond each edge.
+def _evened(mesh: np.ndarray, steep: np.ndarray) -> np.ndarray:
+    """Meshes (P, rows, columns), evened out.
 
-    A median of 3 x 3 cells replaces those that something bright covers, then a mean evens out their noise.
-
-    steep    the mean is left out where it differs by more from the median, across an edge (of a roof)
-    goes_on  whether a gradient goes on beyond the edge; else it ends there
+    A median of 3 x 3 cells replaces those that something bright covers, then a mean evens out their noise. The mean is
+    left out where it differs from the median by more than steep (P,), across an edge (of a roof).
     """
-    base = mesh.mean()
-    around = np.pad(mesh - base, 2, "reflect", reflect_type="odd").astype(np.float32)
-    typical = cv2.medianBlur(around, 3)
-    mean = cv2.blur(typical, (3, 3))
-    even = np.where(np.abs(mean - typical) < steep, mean, typical)[2:-2, 2:-2] + base
-    return np.pad(even, 1, "reflect", reflect_type="odd") if goes_on else np.pad(even, 1, "edge")
+    base = mesh.mean((1, 2), keepdims=True)
+    around = np.pad(mesh - base, 2 * np.array(BEYOND), "reflect", reflect_type="odd").astype(np.float32)
+    typical = np.stack([cv2.medianBlur(one, 3) for one in around])
+    mean = np.stack([cv2.blur(one, (3, 3)) for one in typical])
+    even = np.where(np.abs(mean - typical) < steep[:, None, None], mean, typical)
+    return even[:, 2:-2, 2:-2] + base
 
 
 def between(mesh: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:

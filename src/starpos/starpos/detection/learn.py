@@ -219,7 +219,7 @@ UNLIKE, DARKEST = 0.005, 1e-9
 OWN_ROUNDS, CENTRINGS = 3, 2
 # Rounds in which one window is fitted to all, from this sigma (px) where none has a shape; the least squared width (px2)
 # of an image through it.
-COMMON_ROUNDS, FIRST_SIGMA, THINNEST = 4, 1.5, 0.1
+COMMON_ROUNDS, FIRST_SIGMA, THINNEST = 2, 1.5, 0.1
 # Number of stars that agree by more than chance, and their maximum difference (log of width, ellipticity); twigs differ.
 ALIKE, LIKENESS = 5, 0.6
 # Rounds of fitting and refining the PSF, and the order of its terms.
@@ -391,14 +391,15 @@ def _typical_shape(light: np.ndarray, blur: float, many: bool) -> tuple[np.ndarr
     if (sound & alike).any():
         typical = np.median(shape[sound & alike], axis=0)[None]
     # faint stars' own windows follow their noise: once more through one window of the shape that all have
+    x, y = centroid(light, middle, middle, typical)
     for _ in range(COMMON_ROUNDS):
         window = window_for(typical)
-        x, y = centroid(light, middle, middle, typical)
         seen = window_moments(light, -x, -y, window)[2]
         usable = alike & (squared_widths(seen)[:, 0] > THINNEST)
         if not usable.any():
             return None, alike
-        over = np.linalg.inv(np.median(seen[usable], axis=0)) - np.linalg.inv(window)
+        seen = np.array([median(moment) for moment in seen[usable].reshape(-1, 4).T.copy()]).reshape(2, 2)
+        over = np.linalg.inv(seen) - np.linalg.inv(window)
         typical = clip_widths(over, 1 / widest, 1 / NARROWEST, -1.0)
     return clip_widths(typical - blur * np.eye(2), NARROWEST, np.inf, 1.0), alike
 
@@ -453,7 +454,7 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
     flux: np.ndarray = light / np.maximum(information, 1e-12)
     mean = np.maximum(flux.mean(1, keepdims=True), DARKEST_MEAN)
     own, error2 = flux / mean, 1 / np.maximum(information * mean**2, 1e-12)
-    gain, spread2 = np.median(own, axis=0), 0.0
+    gain, spread2 = np.array([median(each) for each in own.T.copy()]), 0.0
     for _ in range(GAIN_ROUNDS):
         weight = 1 / (error2 + spread2 + 1e-6)
         weight *= (own - gain) ** 2 * weight < OUTLYING_GAIN**2
