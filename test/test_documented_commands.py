@@ -14,8 +14,8 @@ from test_documents import DOCUMENTS, ROOT, flat
 from test_policies import allowed
 
 from starpos.cli import main, parser_for
+from starpos.files import rows_of
 from starpos.instrument import instrument_file
-from starpos.parameters.table import rows_of
 
 LAUNCH = ROOT / "src" / "starpos_bringup" / "launch"
 PARAMETERS = {

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from starpos.parameters.table import rows_of
+from starpos.files import rows_of
 
 OUTPUTS = Path(__file__).with_name("data") / "outputs.yaml"
 # Exit status: no answer; input that cannot be read.

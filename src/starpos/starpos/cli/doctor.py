@@ -21,7 +21,7 @@ from starpos import __version__
 from starpos.cli import console
 from starpos.cli.commands import DATA
 from starpos.errors import StarposError, one_line
-from starpos.parameters.table import rows_of
+from starpos.files import rows_of
 from starpos.units import DAY_S
 
 PACKAGES = DATA / "packages.yaml"

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli.console import OUTPUTS, values
-from starpos.files import save
+from starpos.files import rows_of, save
 from starpos.night.watching import Kept
-from starpos.parameters.table import rows_of
 from starpos.report.html import document, wide_table
 from starpos.units import ARCSEC, utc_text
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-"""Learning a PSF: normal equations of its terms with each star's place and gains eliminated, and the noise.
+"""Learning a PSF: normal equations of its terms with each star's place and gains eliminated, light by phase, and the noise.
 
 The noise is that which grows with a star's light, from what fits leave.
 """
@@ -304,3 +304,37 @@ def light_noise(
             p.count += 1
         photon, misfit2 = _fit_noise(&p, photon, misfit * misfit, outlier * outlier)
     return photon, sqrt(misfit2)
+
+
+def phase_fluxes(
+    const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
+    const unsigned char[:, :, ::1] phase, const float[:, :, ::1] value, double dn_per_photon, double misfit, int phases,
+):
+    """The light of N stars (N, S, S) in each phase of a mosaic, by a PSF's values there (N, S, S).
+
+    The pixels' variance is that of the sky's noise and of the light in the signal: dn_per_photon and misfit, its share.
+
+    Returns (N, phases): each phase's flux, and the inverse of its variance, 1e-12 at least.
+    """
+    cdef Py_ssize_t n = signal.shape[0], area = signal.shape[1] * signal.shape[2], k, j
+    cdef double light, weight, misfit2 = misfit * misfit
+    cdef int p
+    check_stamps(noise.shape, 4, [&signal.shape[0], &value.shape[0], &good.shape[0], &phase.shape[0]])
+    fluxes, weights = np.zeros((2, n, phases))
+    cdef double[:, ::1] flux = fluxes
+    cdef double[:, ::1] information = weights
+    for k in range(n):
+        for j in range(area):
+            p = (&phase[k, 0, 0])[j]
+            if not (&good[k, 0, 0])[j] or p >= phases:
+                continue
+            light = max((&signal[k, 0, 0])[j], <float>0)
+            weight = (&value[k, 0, 0])[j] / (
+                <double>(&noise[k, 0, 0])[j] * (&noise[k, 0, 0])[j] + dn_per_photon * light + misfit2 * light * light
+            )
+            information[k, p] += weight * (&value[k, 0, 0])[j]
+            flux[k, p] += weight * (&signal[k, 0, 0])[j]
+        for p in range(phases):
+            information[k, p] = max(information[k, p], 1e-12)
+            flux[k, p] /= information[k, p]
+    return fluxes, weights

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import spatial
 from scipy.linalg import lapack
 
-from starpos.detection._learn import light_noise, marginal_equations
+from starpos.detection._learn import light_noise, marginal_equations, phase_fluxes
 from starpos.detection._moments import (
     clip_widths,
     own_shapes,
@@ -443,15 +443,11 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
 
     value (N, S, S): the PSF at the stars' pixels.
     """
-    weight = stamps.good * value / before.variance(stamps.noise, stamps.signal)
-    phases = len(before.gain)
-    of_phase = (phases * np.arange(len(value))[:, None, None] + stamps.phase).ravel()
-    light, information = (
-        np.bincount(of_phase, (weight * v).ravel(), phases * len(value)).reshape(-1, phases)
-        for v in (stamps.signal, value)
-    )
+    flux, information = phase_fluxes(
+        stamps.signal, stamps.noise, stamps.good, stamps.phase, value, before.dn_per_photon, before.misfit,
+        len(before.gain),
+    )  # fmt: skip
     # of each phase its light by the PSF over the star's mean, and its variance
-    flux: np.ndarray = light / np.maximum(information, 1e-12)
     mean = np.maximum(flux.mean(1, keepdims=True), DARKEST_MEAN)
     own, error2 = flux / mean, 1 / np.maximum(information * mean**2, 1e-12)
     gain, spread2 = np.array([median(each) for each in own.T.copy()]), 0.0

@@ -16,11 +16,11 @@ from starpos import __version__
 from starpos.averaging.average import Average
 from starpos.calibration import residual_map
 from starpos.errors import TimeError
+from starpos.files import rows_of
 from starpos.fix.fix import PlaceFix, length_text
 from starpos.gnss.solving import Watched
 from starpos.gnss.watch import GnssStatus
 from starpos.night.night import Night, Truth
-from starpos.parameters.table import rows_of
 from starpos.report import coast, measures, night_figures, style
 from starpos.report.html import document, figures, sexagesimal, table
 from starpos.report.style import Picture, figures_of

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.detection._learn import light_noise
+from starpos.detection._learn import light_noise, phase_fluxes
 
 N, SIZE = 20, 9
 
@@ -66,3 +66,21 @@ def test_images_of_other_shapes_are_refused(rng):
         light_noise(given[0][1:], *given[1:], 0.0, 0.0, 5.0)
     with pytest.raises(ValueError, match="as many"):
         light_noise(*given[:4], np.zeros((N, 0, 0), np.float32), 0.0, 0.0, 5.0)
+
+
+def test_fluxes_of_phases_are_weighted_means(rng):
+    signal, noise = (
+        rng.normal(50, 20, (8, 7, 7)).astype(np.float32),
+        rng.uniform(2, 4, (8, 7, 7)).astype(np.float32),
+    )
+    value, good = rng.uniform(0, 0.1, (8, 7, 7)).astype(np.float32), rng.random((8, 7, 7)) < 0.8
+    phase = rng.integers(0, 4, (8, 7, 7)).astype(np.uint8)
+    light = np.maximum(signal, 0)
+    weight = good / (noise**2 + 0.7 * light + (0.05 * light) ** 2)
+    flux, information = phase_fluxes(signal, noise, good, phase, value, 0.7, 0.05, 4)
+    for k in range(4):
+        own = weight * (phase == k)
+        np.testing.assert_allclose(information[:, k], (own * value**2).sum((1, 2)), rtol=1e-5)
+        np.testing.assert_allclose(
+            flux[:, k] * information[:, k], (own * value * signal).sum((1, 2)), rtol=1e-5
+        )
