@@ -117,6 +117,8 @@ class AlpacaCamera:
             raise CaptureError("the server's reply is longer than any that has a meaning.")
         if response.status != 200:
             raise CaptureError(f"the server answers {response.status} {_words(body)}.".replace("..", "."))
+        if not body:
+            raise HTTPException("the server ended before its answer")
         answer = json.loads(body)
         if number := int(answer["ErrorNumber"]):
             said = _words(str(answer.get("ErrorMessage") or "no reason given").encode()).rstrip(".")
