@@ -67,8 +67,9 @@ def test_a_package_holds_all_that_ships(command, tmp_path):
 
 def test_who_made_the_data_is_said():
     said = (REPOSITORY / "REUSE.toml").read_text()
-    # rows of commands, parameters and data sheets are this project's own, and each file says so
-    own = {PACKAGE / "starpos" / room / "data" for room in ("cli", "instrument", "parameters")}
+    # rows of commands, keywords, parameters and data sheets are this project's own, and each file says so
+    rooms = "cli", "frames", "instrument", "navigation", "parameters", "satellites"
+    own = {PACKAGE / "starpos" / room / "data" for room in rooms}
     for data in {*PACKAGE.glob("starpos/*/data")} - own:
         assert f'"{data.relative_to(REPOSITORY).as_posix()}/**"' in said
 

@@ -14,11 +14,13 @@ import numpy as np
 from starpos.errors import FrameError
 from starpos.frames.frame import PATTERNS
 from starpos.frames.pictures import frame_pixels
+from starpos.frozen import at_once
 
 MOSAICS = tuple(filter(None, PATTERNS))
 COLOURS = ("rgb", "rgba", "bgra")
 
 
+@at_once
 @dataclass(frozen=True)
 class Encoding:
     """How pixels lie in a row.
