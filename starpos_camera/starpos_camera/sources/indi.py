@@ -285,15 +285,20 @@ def set_up(device: IndiDevice, exposure_s: float, gain: float | None, binning: i
         if width and height:
             _set_numbers(device, "CCD_FRAME", X=0.0, Y=0.0, WIDTH=width, HEIGHT=height)
     if gain is not None:
-        found = [(v, m) for v, m in GAINS if m in device.vector(v).members]
-        if not found:
+        # A driver defines its properties one after the other, and nothing says which is the last.
+        if not device.until(lambda: _gains_of(device), ANSWER_S):
             raise CaptureError("it has no gain to be set: leave `gain` unset.")
-        vector, member = found[0]
+        vector, member = _gains_of(device)[0]
         _check_limits(device, vector, member, gain, "`gain`")
         if device.vector(vector).number(member) != gain:
             # The driver may round the gain to one that the camera has.
             _set(device, vector, **{member: repr(float(gain))})
     _check_limits(device, "CCD_EXPOSURE", "CCD_EXPOSURE_VALUE", exposure_s, "`exposure` (s)")
+
+
+def _gains_of(device: IndiDevice) -> list[tuple[str, str]]:
+    """The vectors and members that set the gain."""
+    return [(v, m) for v, m in GAINS if m in device.vector(v).members]
 
 
 def expose(device: IndiDevice, exposure_s: float, readout_s: float) -> ET.Element:
