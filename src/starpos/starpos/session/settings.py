@@ -78,7 +78,7 @@ class NodeSettings:
 
     def refuse(self) -> None:
         """Raise a StarposError if values do not go together, or not with the contents of the files."""
-        _ = self.atmosphere, self.site
+        _ = self.atmosphere, self.vertical, self.site
 
     def adopt(self) -> None:
         """Use the files that the last check has read."""
