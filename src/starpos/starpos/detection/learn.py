@@ -219,7 +219,7 @@ UNLIKE, DARKEST = 0.005, 1e-9
 OWN_ROUNDS, CENTRINGS = 3, 2
 # Rounds in which one window is fitted to all, from this sigma (px) where none has a shape; the least squared width (px2)
 # of an image through it.
-COMMON_ROUNDS, FIRST_SIGMA, THINNEST = 2, 1.5, 0.1
+COMMON_ROUNDS, FIRST_SIGMA, THINNEST = 4, 1.5, 0.1
 # Number of stars that agree by more than chance, and their maximum difference (log of width, ellipticity); twigs differ.
 ALIKE, LIKENESS = 5, 0.6
 # Rounds of fitting and refining the PSF, and the order of its terms.
@@ -391,9 +391,9 @@ def _typical_shape(light: np.ndarray, blur: float, many: bool) -> tuple[np.ndarr
     if (sound & alike).any():
         typical = np.median(shape[sound & alike], axis=0)[None]
     # faint stars' own windows follow their noise: once more through one window of the shape that all have
-    x, y = centroid(light, middle, middle, typical)
     for _ in range(COMMON_ROUNDS):
         window = window_for(typical)
+        x, y = centroid(light, middle, middle, typical)
         seen = window_moments(light, -x, -y, window)[2]
         usable = alike & (squared_widths(seen)[:, 0] > THINNEST)
         if not usable.any():
