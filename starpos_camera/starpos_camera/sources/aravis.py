@@ -38,7 +38,7 @@ def stamp_of_camera(
     received_s: float,
     values: Mapping,
 ) -> CapturedFrame:
-    """Date a frame by the better time: the camera's, or that of command or arrival.
+    """Date a frame by the better time: the camera's, or the time of command or arrival.
 
     camera_s     the frame's time on the camera's clock; None: not reported
     relation     of `clock_relation`; None: the camera's clock cannot be read

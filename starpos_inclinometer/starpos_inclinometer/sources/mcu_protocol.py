@@ -190,7 +190,7 @@ class LineParser:
 
 
 def _form(letter: str, **digits: int) -> re.Pattern[bytes]:
-    """The form of a body: a letter, and the named fields of so many hexadecimal digits."""
+    """The form of a body: a letter, and the named fields of a number of hexadecimal digits each."""
     fields = "".join(rf",(?P<{name}>[0-9A-F]{{{count}}})" for name, count in digits.items())
     return re.compile((letter + fields).encode())
 

@@ -130,7 +130,7 @@ class Directions:
         return self.without()
 
     def without(self, source: str = "") -> np.ndarray:
-        """The covariance (D, D) without that of one source."""
+        """The covariance (D, D) without the one of one source."""
         return np.sum([c for name, c in self.sources.items() if name != source], axis=0)
 
     @property

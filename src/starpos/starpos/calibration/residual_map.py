@@ -75,7 +75,7 @@ def draw_rms(axes: "Axes", xy: np.ndarray, residual: np.ndarray, width: int, hei
 def _means(
     xy: np.ndarray, values: np.ndarray, along: int, width: int, height: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Edges in px of the rows and columns of square cells over a frame, `along` of them on its longer side, and in each
+    """Edges in px of the rows and columns of square cells over a frame, `along` of them on its longer side. And in each
     the means (k, rows, columns) of values (N, k) at xy (N, 2) px; NaN in cells with fewer than MIN_IN_CELL.
     """
     size = max(width, height) / along

@@ -38,7 +38,7 @@ from starpos.detection.stamps import (
 PLACES = 12
 # and widths that vary over the field must be better than constant ones by this F.
 SIGNIFICANT = 4.0
-# and maximum distance of any of these stars from it, over the median distance, in so many rounds.
+# and maximum distance of any of these stars from it, over the median distance, in a number of rounds.
 OUTLYING, FIELD_ROUNDS = 6.0, 4
 # Prior of each coefficient, 1 sigma.
 LIKELY = 0.3
@@ -68,7 +68,7 @@ def widened(psf: Psf, x: np.ndarray, y: np.ndarray, ratio: np.ndarray, weight: n
             return psf
         weighted = field.T * (weight * kept)
         normal = weighted @ field
-        # what the places do not tell, as on a line, is 0
+        # what the places do not show, as on a line, is 0
         normal.flat[:: MONOMIALS + 1] += 1e-12 * normal.trace()
         fitted = np.linalg.solve(normal, weighted @ own)
         off, those = np.sqrt(weight) * np.abs(own - field @ fitted).max(1), kept
@@ -447,7 +447,7 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
         stamps.signal, stamps.noise, stamps.good, stamps.phase, value, before.dn_per_photon, before.misfit,
         len(before.gain),
     )  # fmt: skip
-    # of each phase its light by the PSF over the star's mean, and its variance
+    # the light of each phase by the PSF over the star's mean, and its variance
     mean = np.maximum(flux.mean(1, keepdims=True), DARKEST_MEAN)
     own, error2 = flux / mean, 1 / np.maximum(information * mean**2, 1e-12)
     gain, spread2 = np.array([median(each) for each in own.T.copy()]), 0.0

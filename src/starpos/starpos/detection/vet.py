@@ -160,7 +160,7 @@ def _measured(
 def _any_within(
     pixels: np.ndarray, left: np.ndarray, top: np.ndarray, axes: np.ndarray, widths: float
 ) -> np.ndarray:
-    """Whether one of the pixels, (N, S, S) bool, lies within so many widths of the PSF from its star: (N,) bool.
+    """Whether one of the pixels, (N, S, S) bool, lies within the given number of widths from its star: (N,) bool.
 
     left, top (N,) px: first column and row of a stamp, from the centre of the star; axes: as in LocalPsf.
     """

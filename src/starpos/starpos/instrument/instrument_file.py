@@ -126,7 +126,7 @@ def read(path: Path | str, needs_camera: bool = True) -> Instrument:
     """Read an Instrument from its YAML file; InstrumentError says why a file cannot be used.
 
     Of RMS's platepar and `.config` it is the camera alone (platepar.py). docs/reference/files.md#the-instrument has the
-    keys of the format, their units, and what they are in a file that leaves them out.
+    keys of the format, their units, and how a file has them that leaves them out.
 
     Parameters
     ----------

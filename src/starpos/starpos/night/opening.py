@@ -198,7 +198,7 @@ def truth_in(folder: Path) -> Truth | None:
 
 @dataclass(frozen=True)
 class NightOnDisk:
-    """A folder of frames with tilt.csv, its instrument and air as far as `open_night` was told; `solve` solves it.
+    """A folder of frames with tilt.csv, its instrument and air as far as `open_night` got them; `solve` solves it.
 
     Examples
     --------

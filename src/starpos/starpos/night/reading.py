@@ -44,7 +44,7 @@ class Reader:
         return replace(item, mid_unix_s=item.mid_unix_s + late_s, stamp_stddev_s=stamp_s)
 
     def first(self, paths: Sequence[str], levelled: bool = False) -> Stars | None:
-        """What the first frame that can be read states of itself, without its stars; None if none can be read.
+        """The star list of the first frame which can be read, without its stars; None if none can be read.
 
         levelled: rather of the first one that has gravity.
         """

@@ -2,7 +2,7 @@
 """Do calls in this process, or in several processes of this machine.
 
 No kept library does the latter. If a process dies, the pools of concurrent.futures and loky break and do not say at
-which call; the processes of concurrent.futures go on after their parent was killed, and where one dies while others
+which call. The processes of concurrent.futures go on after their parent was killed, and where one dies while others
 start, its pool may raise an OSError. Pebble names the call, but its pool breaks if processes die between two calls. And
 none of them does a call again alone, with all of the machine's memory.
 """

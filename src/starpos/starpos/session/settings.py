@@ -208,7 +208,7 @@ class Settings(NodeSettings):
         return errors.noise_rad
 
     def instrument(self, found: Calibration | None, camera: Camera = ANY_CAMERA) -> Instrument:
-        """The instrument in use with a camera: that of the file, or of the parameters.
+        """The instrument in use with a camera: the one of the file, or of the parameters.
 
         clock_stddev and tilt_stddev, if they are set, replace the values of the file. A calibration from frames (`found`)
         replaces the one from file and parameters; with self_calibration, and before there is a `found`, it counts as
