@@ -12,7 +12,7 @@ from starpos.instrument import instrument_file
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos_interfaces.msg import Solution
-from starpos_interfaces.srv import SelfCalibrate
+from starpos_interfaces.srv import SelfCalibrate, Solve
 from starpos_testing.graph.graph import stamp_of
 from starpos_testing.graph.places import answer_in, headings, misaligned, moved_m, sigma_m, sigmas, site_at
 from starpos_testing.graph.shots import (
@@ -127,6 +127,9 @@ def test_a_burst_of_bad_tilts_does_not_move_it(graph, solver, averaged, rng):
     for shot in bad:
         answer = graph.answer(shot)[0]
         assert answer.status == Solution.NO_TILT and "at another place than before" in answer.status_text
+    # asked again, the frame stays refused
+    again = graph.call(Solve, "solver/solve", Solve.Request()).solution
+    assert again.status == Solution.NO_TILT and again.stars_matched > 3
     after = average_after(graph, averaged, *(noisy(rng) for _ in range(2)))
     check_place(after)
     moved = moved_m(SITE, after.latitude, after.longitude) - moved_m(SITE, before.latitude, before.longitude)
@@ -134,6 +137,14 @@ def test_a_burst_of_bad_tilts_does_not_move_it(graph, solver, averaged, rng):
     # It is not of these frames.
     assert {stamp_of(m) for m in averaged}.isdisjoint(shot.stamp for shot in bad)
     assert average_state(graph, "of all frames here")["frames"] == "10"
+
+
+def test_a_level_that_was_zeroed_is_believed_once_it_is_confirmed(graph, solver, averaged, rng):
+    average_after(graph, averaged, *(noisy(rng) for _ in range(3)))
+    for _ in range(3):
+        assert graph.answer(noisy(rng, off_deg=0.05))[0].status == Solution.NO_TILT
+    assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
+    assert graph.answer(noisy(rng, off_deg=0.05))[0].status == Solution.OK
 
 
 def test_a_move_begins_it_anew(graph, solver, averaged, rng):

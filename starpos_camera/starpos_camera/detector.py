@@ -46,6 +46,8 @@ RAW, COMPRESSED = "camera/image_raw", "camera/image_raw/compressed"
 IMAGE_DEPTH = 1
 # how often publishers are compared with the subscriptions
 PUBLISHERS_LOOK_S = 0.5
+# number of stamps of a topic by which a frame that the other one brings later is known
+STAMPS_KEPT = 4
 
 
 class FrameTopics:
@@ -62,8 +64,8 @@ class FrameTopics:
         self.compressed_topic = node.resolve_topic_name(COMPRESSED)
         if self.compressed_topic == node.resolve_topic_name(COMPRESSED, only_expand=True):
             self.compressed_topic = f"{node.resolve_topic_name(RAW)}/compressed"
-        # stamp of the last frame of each topic
-        self._stamps: dict[type, tuple[int, int]] = {}
+        # stamps of the last frames of each topic
+        self._stamps = {kind: deque[tuple[int, int]](maxlen=STAMPS_KEPT) for kind in (Image, CompressedImage)}
         self._raw_sends = False
         self._compressed: MatchedSubscription | None = None
         self._raw = MatchedSubscription(node, Image, RAW, self._pass_raw, IMAGE_DEPTH)
@@ -117,8 +119,9 @@ class FrameTopics:
 
     def _pass_once(self, message: Any, info: Mapping[str, Any], other: type) -> None:
         """Pass a message on, unless its frame has come on the other topic."""
-        self._stamps[type(message)] = key_of(message.header)
-        if self._stamps.get(other) != key_of(message.header):
+        stamp = key_of(message.header)
+        self._stamps[type(message)].append(stamp)
+        if stamp not in self._stamps[other]:
             self._take(message, info)
 
 

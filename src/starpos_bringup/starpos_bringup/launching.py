@@ -101,7 +101,7 @@ def process(
 ) -> Node:
     """Make a process; LaunchError if an argument is wrong.
 
-    the values of the launch file's arguments.
+    The first mapping has the values of the launch file's arguments.
     parameters, defaults: of its nodes, by name ('**' is all); the parameter file counts less than parameters, more
     than defaults.  remaps: topics by the names that the nodes know them by.
     """

@@ -2,6 +2,7 @@
 """Threads for the long work of a node, so that its executor stays free for signals and services."""
 
 import threading
+import traceback
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -112,5 +113,9 @@ class JobRunner(Jobs):
             self._ended.trigger()
 
     def _on_ended(self) -> None:
-        self._end(self._outcome)
+        # a defect in what takes the outcome must not end the node
+        try:
+            self._end(self._outcome)
+        except Exception:
+            self._node.get_logger().error(traceback.format_exc())
         self._done()

@@ -216,6 +216,8 @@ class Board:
         self.changed = False
         self._values, self._namespace = values, namespace
         self._clock, self._since = clock, clock()
+        # the nodes that have lights, since then
+        self._lit: frozenset[str] = frozenset()
         # By topic: when it was heard, and what it said.
         self._heard: dict[str, tuple[float, dict[str, Any]]] = {}
         self._lights: dict[str, tuple[float, dict[str, Any]]] = {}
@@ -300,6 +302,8 @@ class Board:
         lights = [{**light, "age": now - since} for since, light in shown.values()]
         # A node that has said nothing yet has a light, too; otherwise an all-green page might lack the solver.
         silent = nodes - {_node_of(name) for name in shown}
+        if nodes != self._lit:
+            self._lit, self._since = nodes, now
         unheard = {"level": STALE, "sentence": "nothing heard yet", "age": now - self._since}
         lights += [{"name": text(node, NAME_LETTERS), **unheard} for node in silent]
         told["sun"] = self._sun(now_s)

@@ -22,7 +22,7 @@ import numpy as np
 from starpos.errors import one_line
 from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource
-from starpos_camera.sources.timing import clock_stddev_of, dated_by_driver
+from starpos_camera.sources.timing import check_exposed, clock_stddev_of, dated_by_driver
 
 T = TypeVar("T")
 DEFAULT_EXPOSURE_S = 0.5
@@ -225,6 +225,8 @@ class Alpaca(DeviceSource[AlpacaCamera]):
         self._wait(camera, wanted_s)
         ready_s = self._now()
         exposure_s = camera.optional("lastexposureduration", wanted_s)
+        # before a picture is fetched that cannot be dated
+        check_exposed(exposure_s, wanted_s, (commanded_s, ready_s))
         pixels = camera.picture(*self._size)
         told = camera.optional("lastexposurestarttime", "")
         clock_s = clock_stddev_of("alpaca", self._address.rpartition(":")[0], self._values)

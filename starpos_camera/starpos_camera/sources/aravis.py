@@ -255,7 +255,8 @@ def best_format(offered: list[str], present: str) -> str:
     mosaics = [name for name in known if name.startswith("Bayer")]
     patterns = {name.rstrip(digits) for name in mosaics}
     if len(patterns) > 1:
-        known = [name for name in known if name.rstrip(digits) == present.rstrip(digits)]
+        kind = present.rstrip(digits) if present in FORMATS else "Mono"
+        known = [name for name in known if name.rstrip(digits) == kind]
     elif mosaics:
         known = mosaics
     if not known:

@@ -253,14 +253,17 @@ def connect_camera(device: IndiDevice) -> None:
     device.forget()
     if not connected():
         device.send("CONNECTION", CONNECT="On")
-    wanted = {"CCD_EXPOSURE", "CCD_INFO", "CCD1"}
-    device.until(lambda: refused() or (connected() and wanted <= device.vectors.keys()), CONNECT_S)
+
+    def lacks() -> list[str]:
+        return [name for name in ("CCD_EXPOSURE", "CCD_INFO", "CCD1") if name not in device.vectors]
+
+    device.until(lambda: refused() or (connected() and not lacks()), CONNECT_S)
     if refused() or not connected() or not device.settled(ANSWER_S):
         raise CaptureError(
             f"the driver does not reach its camera{device.last_message()}: check cable and power."
         )
-    if lacks := wanted - device.vectors.keys():
-        raise CaptureError(f"{device.name} has no {min(lacks)}, so it is no camera: correct indi.device.")
+    if lacks():
+        raise CaptureError(f"{device.name} has no {lacks()[0]}, so it is no camera: correct indi.device.")
     device.enable_blobs("CCD1")
 
 

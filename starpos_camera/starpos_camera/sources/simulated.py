@@ -56,7 +56,7 @@ class Simulated(FrameSource):
 
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
         start = self._now() - exposure_s
-        scene = scene_from(self._values)
+        scene = scene_from(dict(self._values))
         stars = expose(scene, load_catalogue(), start, exposure_s, self._rng)
         frame = render(scene, stars, start, exposure_s, self._rng)
         return CapturedFrame(replace(frame, stamp_stddev_s=STAMP_ROUNDING_S), Capture.SIMULATED, scene.camera)

@@ -38,6 +38,15 @@ def dated(
     return CapturedFrame(stamped, source)
 
 
+def check_exposed(exposure_s: float, wanted_s: float, between_s: tuple[float, float]) -> None:
+    """Raise CaptureError unless the exposure that a driver reports fits between command and arrival (Unix s)."""
+    commanded_s, ready_s = between_s
+    if not 0 < exposure_s <= ready_s - commanded_s + CLOCK_TOLERANCE_S:
+        raise CaptureError(
+            f"it says that it has exposed for {exposure_s:g} s, when {wanted_s:g} s were asked."
+        )
+
+
 def dated_by_driver(
     frame: Frame,
     told: str,
@@ -50,14 +59,11 @@ def dated_by_driver(
 
     clock_stddev_s: of the driver's clock; 0: it is this machine's clock; NaN: unknown, and the start is not used.
     exposures_s: the exposure that the driver reports, and the one that was asked for.
-    between_s: Unix times of command and arrival. CaptureError for an exposure that does not fit between them; a start
-    that does not is not used.
+    between_s: Unix times of command and arrival. CaptureError by `check_exposed`; a start that does not fit between
+    them is not used.
     """
-    (exposure_s, wanted_s), (commanded_s, ready_s) = exposures_s, between_s
-    if not 0 < exposure_s <= ready_s - commanded_s + CLOCK_TOLERANCE_S:
-        raise CaptureError(
-            f"it says that it has exposed for {exposure_s:g} s, when {wanted_s:g} s were asked."
-        )
+    check_exposed(*exposures_s, between_s)
+    exposure_s, (commanded_s, ready_s) = exposures_s[0], between_s
     frame = replace(frame, exposure_s=exposure_s)
     commanded = dated_by_command(frame, commanded_s, values)
     start = read_utc(told)

@@ -173,17 +173,18 @@ class Link(TiltSource):
         return arrivals
 
     def health(self) -> Health:
+        shown, complaint = self._shown(), self._complaint()
         with self._lock:
             horizon = self._clock.monotonic_s() - RATE_WINDOW_S
             recent = [t for t in self._recent if t >= horizon]
             span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
-            values = {"openings": self._connections, "unfetched samples": self._dropped, **self._shown()}
+            values = {"openings": self._connections, "unfetched samples": self._dropped, **shown}
             return Health(
                 phase=self._phase,
                 sentence=self._sentence,
                 rate_hz=(len(recent) - 1) / span if span > 0 and self._phase is Phase.RECEIVING else 0.0,
                 counts=self._counts(),
-                complaint=self._complaint(),
+                complaint=complaint,
                 step=self._clock.step,
                 values=values,
             )

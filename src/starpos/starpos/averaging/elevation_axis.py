@@ -259,6 +259,9 @@ def _solved(
         return None
     how = {"method": "trf", "loss": "soft_l1"} if robust else {"method": "lm"}
     found = least_squares(residual, origin, x_scale="jac", xtol=SETTLED, ftol=SETTLED, **how)
+    # at the border of what the frames can have, the slopes are of no residuals
+    if np.abs(found.jac).max() > IMPOSSIBLE:
+        return None
     axis, there = moved(found.x)
     if np.linalg.matrix_rank(found.jac / np.maximum(np.linalg.norm(found.jac, axis=0), 1e-9)) < len(origin):
         return None

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     for name, values in (("X Y", args.pixels), ("--back AZ ALT", args.back)):
         if len(values) % 2:
             raise InstrumentError(f"{name}: {len(values)} numbers are no pairs: give two for each point")
-    overwriting.check(args, overlay=overwriting.ours)
+    overwriting.check(args, overlay=overwriting.picture)
     ground = None if args.horizon is None else horizon.read(args.horizon)
     args.frames, pixels = [args.frame], np.reshape(args.pixels, (-1, 2))
     if args.points is not None:

@@ -222,7 +222,7 @@ def run(args: argparse.Namespace) -> int:
     overwriting.check(
         args,
         camera=overwriting.camera,
-        map=overwriting.ours,
+        map=overwriting.picture,
         platepar=overwriting.never,
         output=instrument_file.check_replaceable,
     )

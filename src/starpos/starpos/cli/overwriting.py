@@ -100,6 +100,12 @@ def check_folder(folder: Path) -> None:
                 path.rmdir()
 
 
+def picture(path: Path) -> None:
+    """The check of a picture: a PNG names the program that made it."""
+    if not (path.is_file() and path.suffix.lower() == ".png" and files.has_mark(path)):
+        raise _there(path, "not a picture made by starpos")
+
+
 def stars(path: Path) -> None:
     """The check of a catalogue."""
     try:

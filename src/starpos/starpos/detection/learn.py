@@ -76,6 +76,8 @@ def widened(psf: Psf, x: np.ndarray, y: np.ndarray, ratio: np.ndarray, weight: n
         kept = off < OUTLYING * median(off)
         if (kept == those).all():
             break
+    if np.count_nonzero(kept) < PLACES:
+        return psf
     own, field, weight = own[kept], field[kept], weight[kept]
     mean = weight @ own / weight.sum()
     before, after = (weight @ ((own - model) ** 2).sum(1) for model in (mean, field @ fitted))
@@ -390,10 +392,10 @@ def _typical_shape(light: np.ndarray, blur: float, many: bool) -> tuple[np.ndarr
     typical, middle = np.eye(2)[None] * FIRST_SIGMA**2, np.full(len(light), reach)
     if (sound & alike).any():
         typical = np.median(shape[sound & alike], axis=0)[None]
+    x, y = centroid(light, middle, middle, typical)
     # faint stars' own windows follow their noise: once more through one window of the shape that all have
     for _ in range(COMMON_ROUNDS):
         window = window_for(typical)
-        x, y = centroid(light, middle, middle, typical)
         seen = window_moments(light, -x, -y, window)[2]
         usable = alike & (squared_widths(seen)[:, 0] > THINNEST)
         if not usable.any():

@@ -119,7 +119,7 @@ def _measured(
     full = _any_within(stamps.full, *corner, local.axes, CORE[0])
     edge = _any_within(~(stamps.good | stamps.full | stamps.spike), *corner, local.axes, CORE[1])
     dot = _is_dot(stamps, fit, lesson.response)
-    smooth, blur = grey(_own_light(stamps, fit, bool(sky.streaks)), sky)
+    smooth, blur = grey(_own_light(stamps, fit), sky)
     shape = psf.shapes_at(stamps.x, stamps.y)
     window = window_for(shape)
     _, _, seen = window_moments(smooth, *corner, window)
@@ -174,16 +174,14 @@ def _any_within(
     return found
 
 
-def _own_light(stamps: Stamps, fit: Fit, streaked: bool) -> np.ndarray:
+def _own_light(stamps: Stamps, fit: Fit) -> np.ndarray:
     """The signals (N, S, S) with the model in pixels that say nothing about the star's own shape.
 
-    These are spikes, a SPECK of outliers, and those that streaks make loud.
+    These are spikes, a SPECK of outliers, and loud ones, as on a streak.
     """
-    lost = stamps.spike | fit.outlier
+    lost = stamps.spike | (stamps.noise > LOUD * stamps.noise.min((1, 2), keepdims=True))
     if fit.outlier.any():
-        lost &= (np.count_nonzero(fit.outlier, axis=(1, 2)) <= SPECK)[:, None, None] | stamps.spike
-    if streaked:
-        lost |= stamps.noise > LOUD * stamps.noise.min((1, 2), keepdims=True)
+        lost |= fit.outlier & (np.count_nonzero(fit.outlier, axis=(1, 2)) <= SPECK)[:, None, None]
     return np.where(lost, fit.model, stamps.signal) if lost.any() else stamps.signal
 
 

@@ -110,7 +110,7 @@ def _check_metadata(tags: dict) -> None:
     # of the same type are heights of a tidal surface (hydroid_height), which is not level
     if (band := items.get("DESCRIPTION", UNDULATION).strip()) != UNDULATION:
         raise GeoidError(f"its band is {band[:60]!r}: one of {UNDULATION} is wanted")
-    if items.get("SCALE", "1") != "1" or items.get("OFFSET", "0") != "0":
+    if items.get("SCALE", "1") not in ("1", "1.0") or items.get("OFFSET", "0") not in ("0", "0.0"):
         raise GeoidError(
             "its values have a SCALE or an OFFSET: gdal_translate -unscale -ot Float32 applies them"
         )

@@ -11,6 +11,7 @@ import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -165,13 +166,18 @@ FILMED = 96
 MOST_DIGITS = 20
 
 
+@cache
+def _nikons_tables() -> dict[str, bytes]:
+    return {row["name"]: bytes.fromhex(row["value"]) for row in packaged("starpos.frames", "nikon.csv")}
+
+
 def _nikon(note: _Note) -> Gravity | None:
     # offsets count from the byte order
     tags = _Note(note.data[10:], note.order, note.at - 10).tags(0x1D, 0x34, 0x91, 0xA7)
     if not {0x1D, 0x91, 0xA7} <= tags.keys() or tags.get(0x34) == (FILMED,):
         return None
     block, serial = bytes(tags[0x91]), _text(tags[0x1D])
-    facts = {row["name"]: bytes.fromhex(row["value"]) for row in packaged("starpos.frames", "nikon.csv")}
+    facts = _nikons_tables()
     level = facts.get(block[:4].decode("ascii", "replace"))
     if level is None:
         raise FrameError("it is by a Nikon whose level no public table describes")

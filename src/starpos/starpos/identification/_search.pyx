@@ -64,17 +64,22 @@ cdef class Anywhere:
 
 
 cdef struct Limits:
-    # The first looks are at triangles of so many of the brightest stars.
+    # number of the brightest stars whose triangles each of the first looks tries
     int[LOOKS] first_stars
-    # Stars lie within so many sigma of their places; logarithm of the share of detections that may be false. Log-odds of a pose
-    # that is judged, by so many of the brightest catalogue stars on the frame. With larger errors of the centroids a candidate
-    # counts only if another one supports it.
-    double match_sigma, log_false, worth_a_fit, loose_px
+    # maximum distance of a star from its place, in sigma
+    double match_sigma
+    # logarithm of the share of detections that may be false
+    double log_false
+    # minimum log-odds of a candidate that is fitted
+    double worth_a_fit
+    # errors of the centroids, px, above which a candidate counts only if another one supports it
+    double loose_px
+    # maximum number of the brightest catalogue stars by which a pose is judged
     int most_stars
-    # A look-up is limited to triangles for which so many candidates are expected by chance; so many, the best, are looked at.
+    # maximum number of candidates that chance alone makes in a look-up, and of those that are looked at
     double most_candidates
     int most_looked_at
-    # In a crowd of false stars so many triangles are looked up, or more where it has many; and what the two above are there.
+    # in a crowd of false stars: usual number of triangles that are looked up, and the two maxima above
     int most_looked_up
     double most_in_crowd
     int most_supported

@@ -220,7 +220,7 @@ class Calibration:
         if not (np.isnan(self.temperature_c) or abs(self.temperature_c) < MAX_C):
             raise InstrumentError(f"temperature_c of the calibration is {self.temperature_c:g}: give deg C")
         covariance = np.asarray(self.covariance_arcsec2, float)
-        if not np.abs(covariance).max() <= MAX_ARCSEC**2:
+        if not np.abs(covariance).max(initial=0) <= MAX_ARCSEC**2:
             raise InstrumentError(
                 f"the calibration's covariance is beyond any turn: give variances of at most {MAX_ARCSEC**2:g} arcsec2"
             )

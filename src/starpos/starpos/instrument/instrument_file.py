@@ -41,7 +41,7 @@ def read_camera(path: Path) -> Camera:
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InstrumentError(
             f"{path}: a key of this calibration file is missing or of the wrong kind ({repr(error)[:120]}); "
-            "it needs image_width, image_height, camera_square, distortion_coefficients."
+            "it needs image_width, image_height, camera_matrix, distortion_coefficients."
         ) from None
     model, d = stated_lens(model if isinstance(model, str) else reprlib.repr(model), d, str(path))
     if any(type(side) is not int or side > LARGEST_SIDE for side in (width, height)):

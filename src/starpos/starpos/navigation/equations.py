@@ -17,6 +17,7 @@ from starpos.navigation.preintegration import ERRORS, Pieces, Sums, summed
 from starpos.navigation.records import ImuModel, VelocityLog
 from starpos.navigation.vessel import MotionLaw, Vessel
 from starpos.rotation import normalised
+from starpos.units import SIGMA_PER_MAD
 
 # Columns of a node: place m and velocity m/s in ITRS, attitude as a small rotation about ITRS's axes in rad, biases of
 # gyro and accelerometer. If a law of motion stands in for a velocity: also speed along the nose and drift in ITRS
@@ -445,6 +446,10 @@ def prior_rows(motion: Motion, model: ImuModel, vessel: Vessel, law: MotionLaw |
     return rows
 
 
+# velocities farther off come from a slipping wheel or another mishap
+OUTLIER_SIGMA = 5.0
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Odometry:
     """N velocities of a log that lie on a voyage: the interval (N,) and the node (N,) of each.
@@ -492,9 +497,16 @@ class Odometry:
         forward = np.einsum("kji,kj->ki", attitude, motion.velocity[k] + velocity - motion.drift[k])
         return self.velocity - (1 + motion.log_scale) * (forward + np.cross(motion.log_axes, forward))
 
-    def residuals(self, motion: Motion, sums: Sums, pieces: Pieces, vibration: float, n: int) -> Residuals:
-        """Equations of the nodes near velocities."""
-        missed, weight = self.missed(motion, sums, pieces), self.sigma**-2
+    def sound(self, missed: np.ndarray) -> np.ndarray:
+        """Mask (N,) of the velocities within what most of them scatter, or should; missed (N, 3) m/s."""
+        off = np.abs(missed) / self.sigma[:, None]
+        return off.max(1) < OUTLIER_SIGMA * max(1.0, SIGMA_PER_MAD * float(np.median(off)))
+
+    def residuals(
+        self, motion: Motion, missed: np.ndarray, keep: np.ndarray, vibration: float, n: int
+    ) -> Residuals:
+        """Equations of the nodes near velocities to keep (N,); missed (N, 3): measured less predicted, m/s."""
+        weight = keep / self.sigma**2
         total = np.bincount(self.node, weight, len(motion))
         index = np.flatnonzero(total)
         mean = np.stack([np.bincount(self.node, weight * part, len(motion)) for part in missed.T], -1)[index]

@@ -37,8 +37,10 @@ class Pieces:
     @classmethod
     def cut(cls, imu: ImuLog, nodes: np.ndarray) -> "Pieces":
         """Cut readings at the times of nodes (K,), Unix s, in order."""
-        end, zero = imu.utc_unix_s - nodes[0], nodes - nodes[0]
-        begin = end - imu.length_s
+        first, last = np.searchsorted(imu.utc_unix_s, nodes[[0, -1]])
+        near = slice(min(first, len(imu.utc_unix_s) - 1), last + 1)
+        end, zero = imu.utc_unix_s[near] - nodes[0], nodes - nodes[0]
+        begin = end - imu.length_s[near]
         edges = np.unique(np.concatenate([begin, end, zero]))
         edges = edges[(edges >= 0) & (edges <= zero[-1])]
         edges = edges[np.append(True, np.diff(edges) > SHORTEST_S)]
@@ -57,8 +59,8 @@ class Pieces:
             return table
 
         return cls(
-            gyro=spread(imu.gyro[sample]),
-            force=spread(imu.force[sample]),
+            gyro=spread(imu.gyro[near][sample]),
+            force=spread(imu.force[near][sample]),
             length_s=spread(length),
             begin_s=spread(middle - length / 2 - zero[interval]),
             span_s=np.diff(zero),

@@ -112,7 +112,8 @@ class Adjustment:
         # how many times as much wind or current change as their law says
         self.weighings, self.more_drift = 0, 1.0
         self.noise_weighed = False
-        # nodes whose measurement of a kind is wrong
+        # velocities that are wrong, and nodes whose measurement of a kind is
+        self.slipped = np.zeros(0 if self.odometry is None else len(self.odometry.node), bool)
         self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in self.excess}
         self.strays = 0
         # where it stands, None before it is looked for; and whether the rest of the record contradicts that it does
@@ -130,7 +131,7 @@ class Adjustment:
     def left_out(self) -> dict[str, int]:
         """How many measurements of each kind are left out."""
         at = np.zeros(0, int) if self.odometry is None else self.odometry.node
-        velocities = int(np.isin(at, self.wrong["velocities"]).sum())
+        velocities = int((self.slipped | np.isin(at, self.wrong["velocities"])).sum())
         return {"frames": self.strays + len(self.wrong["frames"]), "velocities": velocities}
 
     @property
@@ -212,6 +213,10 @@ class Adjustment:
         if stray.any():
             self.strays = int(stray.sum())
             self.frames = [frame for frame, wrong in zip(self.frames, stray, strict=True) if not wrong]
+            if len(self.frames) < MIN_FRAMES:
+                raise VoyageError(
+                    f"the stars of {len(self.frames)} frames go with the gyro: at least {MIN_FRAMES} are needed"
+                )
             stars = self._attitudes(None)
         if suns := self._suns:
             sun = suns[len(suns) // 2]
@@ -342,10 +347,6 @@ class Adjustment:
 
     def _attitudes(self, zenith: np.ndarray | None) -> StarAttitudes:
         """Attitudes of all frames, as seen under a zenith, or roughly."""
-        if len(self.frames) < MIN_FRAMES:
-            raise VoyageError(
-                f"the stars of {len(self.frames)} frames agree: at least {MIN_FRAMES} are needed"
-            )
         air = self.vessel.atmosphere
         found = [
             (frame.rough(), np.zeros(3)) if zenith is None else frame.under(zenith, air)
@@ -380,7 +381,10 @@ class Adjustment:
         if self._suns:
             parts.append(self._sound(self._places(motion), before, "places"))
         if self.odometry is not None:
-            measured = self.odometry.residuals(motion, sums, self.pieces, self.vibration, n)
+            missed = self.odometry.missed(motion, sums, self.pieces)
+            if before is not None:
+                self.slipped = ~self.odometry.sound(missed)
+            measured = self.odometry.residuals(motion, missed, ~self.slipped, self.vibration, n)
             parts.append(self._sound(measured, before, "velocities"))
         if self.vessel.vehicle == PARKED:
             parts.append(standing_residuals(motion, np.arange(count), STANDING_SIGMA, n))

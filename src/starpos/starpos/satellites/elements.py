@@ -421,14 +421,13 @@ def chosen(
         days = abs(orbit.age_days(utc_unix_s))
         return orbit.errors.along_m + orbit.errors.along_m_per_day * days, days
 
-    # the best of a satellite comes last
-    for orbit in sorted(orbits, key=certain, reverse=True):
+    for orbit in sorted(orbits, key=certain):
         if not orbit.reaches(utc_unix_s):
             left_out["older"].add(orbit.number)
         elif orbit.ephemeris is None and orbit.epoch_unix_s > utc_unix_s and not newer:
             left_out["newer"].add(orbit.number)
         else:
-            best[orbit.number] = orbit
+            best.setdefault(orbit.number, orbit)
     newer_only, older_only = (len(left_out[key] - set(best)) for key in ("newer", "older"))
     said = []
     if newer_only:

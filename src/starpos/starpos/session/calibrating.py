@@ -164,6 +164,7 @@ OF_AVERAGE = OF_CALIBRATION | {
     "refraction.pressure",
     "refraction.temperature",
     "refraction.humidity",
+    "refraction.wavelength",
     "clock_stddev",
     "inclinometer.model",
     "tilt_stddev",

@@ -3,6 +3,7 @@
 
 import math
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -188,7 +189,7 @@ def outcome_of(job: Callable[[], Any], say: Callable[[str], object]) -> Outcome:
         return Outcome(trouble=f"it failed ({type(e).__name__}: {e})")
 
 
-class Jobs:
+class Jobs(ABC):
     """Runs one job at a time; a subclass says where."""
 
     def __init__(self) -> None:
@@ -205,8 +206,9 @@ class Jobs:
         """Drop the outcome of the job that runs, because what it is of has changed."""
         self._then = None
 
+    @abstractmethod
     def _begin(self, job: Callable[[], Any]) -> None:
-        raise NotImplementedError
+        """Begin a job, and call `_end` with its Outcome once it is done."""
 
     def _end(self, outcome: Outcome) -> None:
         then, self._then, self.busy = self._then, None, False

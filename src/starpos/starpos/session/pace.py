@@ -5,10 +5,14 @@ import math
 import statistics
 from collections import deque
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starpos.frames.frame import Stars
 from starpos.session.driver import Now
+
+# the detector loads this module too, and not what a solution consists of
+if TYPE_CHECKING:
+    from starpos.fix.solution import Solution
 
 # Interval over which the share of dropped frames is taken, and minimum number of frames.
 LATELY_S, MIN_FRAMES = 10.0, 10
@@ -109,13 +113,14 @@ COSTS = 9
 MAX_LATE_S = 0.1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Waiting:
     """A frame that waits: the header of its message, and its stars with the error of their time.
 
     since_s: when it came, by the clock in which waiting is counted.
     ahead_s: how far the middle of its exposure was ahead of the session's clock then.
-    doubted: whether its stars contradict its time.
+    doubted: whether earlier frames contradict its time or its level.
+    refused: its answer where these leave it no fix; None otherwise.
     """
 
     header: Any
@@ -123,6 +128,7 @@ class Waiting:
     since_s: float
     ahead_s: float
     doubted: bool = False
+    refused: "Solution | None" = None
 
     def dated(self, now: Now) -> "Waiting":
         """Correct how far it is ahead of a played clock, whose tick may have arrived only after the frame."""

@@ -30,7 +30,7 @@ from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.recording.topics import ALL_INPUTS, CAMERA_INFO, NAV_SAT_FIX, STARS, TILT, TRAILS
 from starpos.session import reports
-from starpos.session.calibrating import Calibrating, Seen
+from starpos.session.calibrating import OF_AVERAGE, Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.deflection import LiveDeflection
 from starpos.session.driver import Answered, Averaged, Changes, Heard, Jobs, Log, Now, Output, Sent, refusing
@@ -55,8 +55,6 @@ J2000_UNIX_S = 946_728_000.0
 CLOCK_SIGMAS = 6.0
 # A clock that goes back by more was set.
 STEP_S = 0.05
-# parameters by which A3 or the level's errors become others
-OF_MOUNTING = ("calibration_url", "inclinometer.model", "misalignment", "misalignment_stddev")
 CAMERA_TOPIC = "camera/camera_info"
 
 
@@ -187,7 +185,7 @@ class SolverSession:
         """Apply a change of these parameters."""
         if "clock_stddev" in names:
             self.doubt.clear()
-        if not names.isdisjoint(OF_MOUNTING):
+        if names & OF_AVERAGE:
             self._level.clear()
         self.calibrating.parameters_set(names)
         self.deflection.parameters_set(names)
@@ -265,7 +263,8 @@ class SolverSession:
             self.pace.drop(now.waiting_s)
             self._heard.refuse("stars", f"a frame was dropped: {MAX_WAITING} wait for their tilts")
             return
-        self._backlog.append(Waiting(header, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
+        ahead_s = now.ahead_s(stars.mid_unix_s)
+        self._backlog.append(Waiting(header=header, stars=stars, since_s=now.waiting_s, ahead_s=ahead_s))
         if self.instrument.preparing and not now.played:
             self.pace.dropped += self._backlog.keep_newest()
 
@@ -415,18 +414,17 @@ class SolverSession:
         if self.doubt.seconds <= stated_s:
             if not self._level.contradicts(fix, stated_s):
                 return frame, answer
-            refused = Solution.failed(frame.stars, Status.NO_TILT, reports.OTHER_LEVEL)
-            return replace(frame, doubted=True), refused
+            return _refused(frame, answer, reports.OTHER_LEVEL)
         frame = replace(frame, stars=replace(frame.stars, clock_stddev_s=self.doubt.seconds), doubted=True)
         if self.doubt.leans_otherwise:
-            return frame, Solution.failed(frame.stars, Status.NO_TILT, reports.OTHER_TILTS)
+            return _refused(frame, answer, reports.OTHER_TILTS)
         known = self._question(frame, hint=answer.hint, until_s=AT_ONCE_S, known=answer.found)
         return frame, self._answer(frame, known)
 
     def _taught(self, frame: Waiting, answer: Solution, compared: bool) -> Answered:
         """The answer to a frame, with gnss.use by what GNSS has taught; compared: with GNSS's place of its time too."""
         stamp, solver, gnss = frame.header.stamp, self.instrument.solver, self.gnss
-        if gnss is None or solver is None:
+        if gnss is None or solver is None or frame.refused is not None:
             return self._output(stamp, answer)
         taught = self._guarded(
             lambda: gnss.solve(solver, frame.stars, answer, compared),
@@ -484,11 +482,14 @@ class SolverSession:
         return Answered(stamp=stamp, solution=answer, ground=ground, no_camera=no_camera)
 
     def solve_again(self) -> Answered | None:
-        """Solve the newest frame with what is known now, identified anew whatever was found before; None without one."""
-        if self.latest is None:
+        """Solve the newest frame with what is known now, identified anew whatever was found before; None without one.
+
+        A frame that earlier ones contradict stays refused.
+        """
+        if (latest := self.latest) is None:
             return None
-        question = self._question(self.latest, until_s=self._search.until_s(None, False))
-        return self._taught(self.latest, self._answer(self.latest, question), compared=False)
+        question = self._question(latest, until_s=self._search.until_s(None, False))
+        return self._taught(latest, latest.refused or self._answer(latest, question), compared=False)
 
     def reset(self) -> None:
         """Forget tilts, frames and the place, but no calibration that was found."""
@@ -501,6 +502,12 @@ class SolverSession:
         self.doubt.clear()
         self._level.clear()
         self.calibrating.forget()
+
+
+def _refused(frame: Waiting, answer: Solution, why: str) -> tuple[Waiting, Solution]:
+    """A frame whose level earlier frames contradict, and its answer: its stars alone."""
+    refused = replace(answer, status=Status.NO_TILT, message=why, fix=None)
+    return replace(frame, doubted=True, refused=refused), refused
 
 
 def _failed(frame: Waiting, what: str, error: Exception) -> Solution:

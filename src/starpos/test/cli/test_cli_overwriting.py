@@ -37,6 +37,14 @@ def test_a_file_of_somebody_else_stays(option, lists, run, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["precious.png"]
 
 
+def test_no_picture_replaces_an_instrument_file_of_starpos(lists, run, tmp_path):
+    mine = tmp_path / "mine.yaml"
+    assert run(*calls(lists, mine)["-o"])[0] == 0
+    before = mine.read_bytes()
+    status, _, errors = run(*calls(lists, mine)["--map"])
+    assert status == 2 and "not a picture" in errors[-1] and mine.read_bytes() == before
+
+
 @pytest.mark.parametrize("name", ["tilt.csv", "stars_0000.csv"])
 @pytest.mark.parametrize("option", ["-o", "--camera", "--map", "--save"])
 def test_what_is_read_is_never_written(option, name, lists, run, tmp_path):

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Evidence of pixels for stars, of compiled code, against its plain form."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from starpos.detection._vetting import correct_sky, replace_spikes
+from starpos.detection._vetting import compare_with_pixel, correct_sky, replace_spikes
+from starpos.detection.vet import _own_light
 from starpos.units import SIGMA_PER_MAD
 
 N, SIZE = 12, 11
@@ -24,6 +27,13 @@ def stamps(rng):
     phase[:, 1::2] += 2
     phase[:, :, 1::2] += 1
     return signal.astype(np.float32), noise.astype(np.float32), good, full, phase
+
+
+@pytest.fixture
+def fits(rng, stamps):
+    """Residual, model and outlier (N, S, S) of a fit."""
+    model = (0.9 * np.maximum(stamps[0], 0)).astype(np.float32)
+    return stamps[0] - model, model, rng.random(model.shape) < 0.02
 
 
 def test_the_sky_at_the_rims_is_taken_off(stamps):
@@ -67,9 +77,43 @@ def test_spikes_become_the_mean_of_their_neighbours(stamps, rng):
     np.testing.assert_allclose(signal, healed, rtol=1e-6, atol=1e-5)
 
 
+def test_pixels_that_say_nothing_of_the_star_become_its_model(stamps, fits, rng):
+    signal, noise, *_ = stamps
+    _, model, outlier = fits
+    noise[3, 4:6] *= 4
+    outlier[5, :2] = True
+    spike = rng.random(signal.shape) < 0.02
+    speck = outlier & (outlier.sum((1, 2)) <= 3)[:, None, None]
+    expected = np.where(speck | spike | (noise > 3 * noise.min((1, 2), keepdims=True)), model, signal)
+    seen = SimpleNamespace(signal=signal, noise=noise, spike=spike)
+    own = _own_light(seen, SimpleNamespace(model=model, outlier=outlier))
+    np.testing.assert_array_equal(own, expected)
+
+
+@pytest.mark.parametrize("half", [0, 3, SIZE // 2])
+def test_one_pixel_is_compared_with_the_star(half, stamps, fits):
+    signal, noise, good, full, _ = stamps
+    residual, model, _ = fits
+    c = slice(SIZE // 2 - half, SIZE // 2 + half + 1)
+    s, n, g, r, m = (a[:, c, c].astype(float) for a in (signal, noise, good, residual, model))
+    variance = n**2 + 0.4 * m + 0.01**2 * m**2
+    score = g * (s / n) ** 2
+    expected = (
+        score.sum((1, 2)) - (score * (s > 0)).max((1, 2)),
+        (g * (r**2 / variance + np.log(variance / n**2))).sum((1, 2)),
+        g.sum((1, 2)),
+        full[:, c, c].sum((1, 2)),
+    )
+    found = compare_with_pixel(signal, noise, good, full, residual, model, 0.4, 0.01, half)
+    for one, plain in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, plain, rtol=1e-5, atol=1e-5)
+
+
 def test_pixels_of_other_stamps_are_refused(stamps):
-    signal, noise, good, _, phase = stamps
+    signal, noise, good, full, phase = stamps
     with pytest.raises(ValueError, match="stamps"):
         correct_sky(signal, noise[:3].copy(), SIGMA_PER_MAD, 0.6, 1.6, 0.01)
     with pytest.raises(ValueError, match="gains"):
         replace_spikes(signal, noise, good, phase, np.ones(2, np.float32), np.ones(N, np.float32), 6.0)
+    with pytest.raises(ValueError, match="middle"):
+        compare_with_pixel(signal, noise, good, full, signal, signal, 0.4, 0.01, SIZE)

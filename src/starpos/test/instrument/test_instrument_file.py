@@ -206,6 +206,7 @@ REFUSED = {
     "a covariance in a row": (COVARIANCE % "[1, 2, 3]", "give a list of numbers"),
     "a covariance in words": (COVARIANCE % "[[a, 0, 0], [0, 1, 0], [0, 0, 1]]", "is 'a': give a number"),
     "a covariance of nothing": (COVARIANCE % "", "calibration_covariance_arcsec2 is missing"),
+    "an empty covariance": (COVARIANCE % "[]", "the calibration's covariance"),
     "a covariance beyond sense": (
         COVARIANCE % "[[1e300, 0, 0], [0, 1e300, 0], [0, 0, 1]]",
         "beyond any turn",

@@ -92,6 +92,16 @@ def test_a_wheel_that_slips_is_left_out(record):
     assert 50 < slipped.left_out["velocities"] < 70 and "velocities contradict the rest" in slipped.faults[0]
 
 
+def test_single_wild_velocities_are_left_out_and_their_neighbours_stay(record):
+    def wild(t, velocity):
+        velocity[100::50, 1] += 5.0
+        return velocity
+
+    number = len(range(100, len(record.velocity.velocity), 50))
+    voyage = navigated(with_velocity(record, wild))
+    assert nees(voyage, record) < 16 and voyage.left_out["velocities"] == number
+
+
 def test_velocities_worse_than_stated_widen_the_claim(record, rng):
     poor = navigated(with_velocity(record, lambda t, v: v + rng.normal(0, 0.2, v.shape)))
     assert nees(poor, record) < 16 and sigma_m(poor) > 1.2 * sigma_m(navigated(record))

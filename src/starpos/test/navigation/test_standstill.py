@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from voyage_calls import navigated, nees, sigma_m
+from voyage_calls import navigated, nees, sigma_m, vessel
 
 from starpos.navigation.chain import Chain, smoothed
 from starpos.navigation.equations import CONSTANTS, MEASURED, VELOCITY, Residuals, StarAttitudes
 from starpos.navigation.evidence import NOWHERE, Standstills, by_the_rest, noise_density2, standstills
 from starpos.navigation.preintegration import Pieces
 from starpos.navigation.records import ImuLog
+from starpos.navigation.voyage import Adjustment
 from starpos_testing.halting import even, halting, idling, on_carriers
 from starpos_testing.voyages import INDUSTRIAL, made
 
@@ -129,6 +130,18 @@ def test_standstills_are_some_of_them_by_a_mask():
     both = Standstills(first=np.array([2, 9]), last=np.array([4, 9]))
     assert both.nodes.tolist() == [2, 3, 4, 9] and both.middle.tolist() == [3, 9]
     assert both.but(np.array([False, True])).nodes.tolist() == [9]
+
+
+@pytest.mark.parametrize("vehicle", ["rover", "ship", "parked", None])
+def test_only_a_rover_without_odometry_is_looked_at_for_standstills(vehicle):
+    record = made("rover", 20, 3, rate_hz=25)
+    nodes = record.frames_s
+    for velocity in (None, record.velocity):
+        adjustment = Adjustment(
+            record.frames, nodes, Pieces.cut(record.imu, nodes), velocity, vessel(vehicle), 0.0
+        )
+        looked_at = vehicle == "rover" and velocity is None
+        assert adjustment.standing is (None if looked_at else NOWHERE)
 
 
 def driven(drive, seed=3, noisier=1.0):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import SatelliteError
-from starpos.satellites.elements import CLASSES, StoredOrbits, read_orbits
+from starpos.satellites.elements import CLASSES, StoredOrbits, chosen, read_orbits
 from starpos.satellites.orbits import Moments, states
 
 FIRST = "1 00005U 58002B   00179.78495062  .00000023  00000-0  28098-4 0  4753"
@@ -55,6 +55,12 @@ def test_all_forms_of_elements_are_the_same_orbit(tmp_path, name):
     ours, theirs = (states([o], moment, np.zeros(1))[0] for o in (orbit, reference))
     # the lines' epoch has a digit of 0.9 ms, and microseconds in OMM: 5 m
     assert np.linalg.norm(ours - theirs) < 8
+
+
+def test_of_elements_that_are_as_good_the_first_counts(tmp_path):
+    (tmp_path / "two.tle").write_text(f"0 ONE\n{FIRST}\n{SECOND}\n0 OTHER\n{FIRST}\n{SECOND}\n")
+    (orbit,), _ = chosen(read_orbits(tmp_path / "two.tle")[0], WHEN + 3600)
+    assert orbit.name == "ONE"
 
 
 def test_a_broken_line_costs_its_satellite_alone(tmp_path):
