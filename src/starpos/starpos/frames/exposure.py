@@ -88,7 +88,8 @@ class Exposure:
     gravity         which way is up in it by its own file, as a telephone's photograph has it; None: not stated
     unlevelled      why gravity is None, for messages
     upper_edge      direction in C of the edge that was up, (0, 0) if unknown, of a telephone's picture; None: of others
-    site_cards      the cards of its header that state a site, for messages; never used for a place; '': none
+    site_cards      the cards of its header that state a site, for messages; '': none
+    site_deg        that site's latitude and longitude, of either sign; compared with a fix, never used; None: not stated
     aim_deg         right ascension and declination to which its header says that it was pointed; only a hint; None: not
                     stated
     gps_deg         latitude and longitude by GPS in its file, WGS 84; compared with a fix, never used; None: not stated
@@ -113,6 +114,7 @@ class Exposure:
     upper_edge: tuple[int, int] | None = None
     gps_deg: tuple[float, float] | None = None
     site_cards: str = ""
+    site_deg: tuple[float, float] | None = None
     aim_deg: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:

@@ -81,6 +81,7 @@ def read_exposure(header: Mapping, place: str, comments: Mapping[str, str] = NO_
         shutter=shutter(header, place),
         origin_px=origin_px(header),
         site_cards=site_cards(header),
+        site_deg=site_deg(header),
         aim_deg=aim_deg(header),
     )
 
@@ -123,6 +124,20 @@ def site_cards(header: Mapping) -> str:
         if len(_stated(header, keys)) == 2:
             return " and ".join(f"{key} {one_line(header[key])}" for key in keys)
     return ""
+
+
+def site_deg(header: Mapping) -> tuple[float, float] | None:
+    """Latitude and longitude (deg) of the site of `site_cards`; None without, and for 0, 0, which programs leave empty.
+
+    Programs differ in the longitude's sign.
+    """
+    for keys in zip(CARDS["latitude"], CARDS["longitude"], strict=True):
+        up, right = (_sexagesimal(header.get(key)) for key in keys)
+        if up is not None and right is not None:
+            latitude, longitude = up[0], right[0]
+            if abs(latitude) <= 90 and abs(longitude) <= 360 and (latitude or longitude):
+                return latitude, longitude
+    return None
 
 
 def origin_px(header: Mapping) -> tuple[float, float] | None:

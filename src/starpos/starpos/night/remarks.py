@@ -210,11 +210,12 @@ MISTAKES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
 @at_once
 @dataclass(frozen=True)
 class Near:
-    """A place, in rad, at which the instrument is said to be within some km."""
+    """A place, in rad, at which the instrument is said to be within some km; stated_by: for sentences."""
 
     latitude: float
     longitude: float
     km: float = NEAR_KM
+    stated_by: str = "--near"
 
     def km_from(self, latitude: float, longitude: float) -> float:
         """Distance in km, on a sphere, to a place in rad."""
@@ -244,7 +245,7 @@ def _far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequ
     sigma_m = float(np.sqrt(np.diag(fix.covariance)[:2].max()))
     if km <= near.km + FAR_SIGMA * sigma_m / 1000:
         return ""
-    told = f"the place is {km:.0f} km from --near, and should be within {near.km:g} km"
+    told = f"the place is {km:.0f} km from {near.stated_by}, and should be within {near.km:g} km"
     for name, places in _places(mounting, frames):
         off = [near.km_from(*place) for place in places]
         if max(off) <= near.km:

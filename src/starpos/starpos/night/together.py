@@ -60,6 +60,7 @@ class Gathered:
     solved: those with a fix, without the details of each star; headings: those with a heading at a known place;
     circles: of those that saw the Sun, which serve where nothing is solved; warnings: of all, each once.
     marks_deg: the places that GPS wrote into the files of those with a fix.
+    site: of the header of the first of them that states one.
     lost: the stars of the first frame that was not identified; None without one.
     unreadable: whether a file was.
     """
@@ -67,6 +68,7 @@ class Gathered:
     def __init__(self) -> None:
         self.solved: list[Solution] = []
         self.marks_deg: list[tuple[float, float]] = []
+        self.site: Near | None = None
         self.headings: list[Solution] = []
         self.circles: list[Circle] = []
         self.warnings: set[str] = set()
@@ -83,6 +85,9 @@ class Gathered:
             self.solved.append(replace(s, fix=light, star=None, found=None, hint=None, at_place=None))
             if answer.stars is not None and answer.stars.gps_deg is not None:
                 self.marks_deg.append(answer.stars.gps_deg)
+            if answer.stars is not None and answer.stars.site_deg is not None and self.site is None:
+                latitude, longitude = np.radians(answer.stars.site_deg).tolist()
+                self.site = Near(latitude, longitude, stated_by=f"the header's {answer.stars.site_cards}")
         if s.at_place:
             self.headings.append(s)
         if s.circle is not None:
@@ -129,6 +134,10 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
             mounting = given.mounting
         said += [] if whole is None else [remarks.of_table(fixes, whole, given)]
         said += [remarks.of_copies(fixes)] if given.has_level_inside else []
+    if near is None and (site := gathered.site) is not None:
+        # programs differ in the sign of the longitude
+        sides = site, replace(site, longitude=-site.longitude)
+        near = min(sides, key=lambda side: side.km_from(place.latitude, place.longitude))
     said += [remarks.of_marks(place, gathered.marks_deg), *doubts(fixes, place, mounting, near)]
     return Together(whole, why_not, tuple(filter(None, said)))
 
