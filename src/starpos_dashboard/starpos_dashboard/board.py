@@ -217,7 +217,7 @@ class Board:
         self._values, self._namespace = values, namespace
         self._clock, self._since = clock, clock()
         # the nodes that have lights, since then
-        self._lit: frozenset[str] = frozenset()
+        self._lit = self._nodes
         # By topic: when it was heard, and what it said.
         self._heard: dict[str, tuple[float, dict[str, Any]]] = {}
         self._lights: dict[str, tuple[float, dict[str, Any]]] = {}
