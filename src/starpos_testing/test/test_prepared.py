@@ -18,7 +18,11 @@ PACKAGE = "starpos_inclinometer"
 SAYS = (
     "import os, sys, threading; print(sys.argv, os.getcwd(), threading.active_count(), __name__); sys.exit(3)"
 )
-WAITS = "import time; print('here', flush=True)\nwhile True: time.sleep(0.1)"
+# a shell's background programs ignore SIGINT until they set it
+WAITS = (
+    "import signal, time; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    "print('here', flush=True)\nwhile True: time.sleep(0.1)"
+)
 FAILS = "import sys; print('before'); sys.stderr.write('said '); raise KeyError('defect')"
 # starts a program and says which
 TESTS = f"""
