@@ -122,6 +122,8 @@ class FrameTopics:
         stamp = key_of(message.header)
         self._stamps[type(message)].append(stamp)
         if stamp not in self._stamps[other]:
+            # a bag that is played again has the same stamps
+            self._stamps[other].clear()
             self._take(message, info)
 
 

@@ -179,6 +179,7 @@ def test_the_deepest_format_is_taken_and_of_a_colour_sensor_its_mosaic():
     assert best_format(several, "Mono8") == "Mono16"
     assert best_format(several, "BayerGB8") == "BayerGB8"
     assert best_format(several, "RGB8") == best_format(several, "BayerRG12p") == "Mono16"
+    assert best_format(several, "BayerGB12p") == "BayerGB8"
     with pytest.raises(CaptureError, match="unpacked Mono and Bayer"):
         best_format(["Mono12p", "RGB8"], "RGB8")
 

@@ -246,7 +246,7 @@ def _find_camera(aravis: ModuleType, wanted: str) -> str:
 
 
 def best_format(offered: list[str], present: str) -> str:
-    """Choose the deepest format that is known; of a colour sensor its mosaic, of several the present one.
+    """Choose the deepest format that is known; of a colour sensor its mosaic, of several the present one, else Mono.
 
     A mosaic alone has the sensor's own pixels: a colour camera makes its Mono by interpolation. A camera that offers
     several patterns has only one at a time, so those other than the present format's are no choice.
@@ -255,7 +255,7 @@ def best_format(offered: list[str], present: str) -> str:
     mosaics = [name for name in known if name.startswith("Bayer")]
     patterns = {name.rstrip(digits) for name in mosaics}
     if len(patterns) > 1:
-        kind = present.rstrip(digits) if present in FORMATS else "Mono"
+        kind = next((pattern for pattern in patterns if present.startswith(pattern)), "Mono")
         known = [name for name in known if name.rstrip(digits) == kind]
     elif mosaics:
         known = mosaics

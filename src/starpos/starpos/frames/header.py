@@ -80,9 +80,8 @@ def read_exposure(header: Mapping, place: str, comments: Mapping[str, str] = NO_
         pixel_um=_positive(header, "XPIXSZ"),
         shutter=shutter(header, place),
         origin_px=origin_px(header),
-        site_cards=site_cards(header),
-        site_deg=site_deg(header),
         aim_deg=aim_deg(header),
+        **site(header),
     )
 
 
@@ -118,26 +117,23 @@ def _sexagesimal(value: Any) -> tuple[float, bool] | None:
     return -size if parts[0].startswith("-") else size, len(parts) > 1
 
 
-def site_cards(header: Mapping) -> str:
-    """The cards with which a header states a site, for messages; '' without any."""
+def site(header: Mapping) -> dict[str, Any]:
+    """An Exposure's site_cards and site_deg by the first cards that state a site; programs leave 0, 0 for none."""
     for keys in zip(CARDS["latitude"], CARDS["longitude"], strict=True):
-        if len(_stated(header, keys)) == 2:
-            return " and ".join(f"{key} {one_line(header[key])}" for key in keys)
-    return ""
+        latitude, longitude = (_coordinate_deg(header.get(key)) for key in keys)
+        if abs(latitude) <= 90 and abs(longitude) <= 360 and (latitude or longitude):
+            cards = " and ".join(f"{key} {one_line(header[key])}" for key in keys)
+            return {"site_cards": cards, "site_deg": (latitude, longitude)}
+    return {}
 
 
-def site_deg(header: Mapping) -> tuple[float, float] | None:
-    """Latitude and longitude (deg) of the site of `site_cards`; None without, and for 0, 0, which programs leave empty.
-
-    Programs differ in the longitude's sign.
-    """
-    for keys in zip(CARDS["latitude"], CARDS["longitude"], strict=True):
-        up, right = (_sexagesimal(header.get(key)) for key in keys)
-        if up is not None and right is not None:
-            latitude, longitude = up[0], right[0]
-            if abs(latitude) <= 90 and abs(longitude) <= 360 and (latitude or longitude):
-                return latitude, longitude
-    return None
+def _coordinate_deg(value: Any) -> float:
+    """A latitude or a longitude, of which S and W are negative; NaN for another text."""
+    text = str(value).strip()
+    found = _sexagesimal(text.strip("NSEW "))
+    if found is None:
+        return math.nan
+    return -found[0] if text[-1:] in "SW" or text[:1] in "SW" else found[0]
 
 
 def origin_px(header: Mapping) -> tuple[float, float] | None:

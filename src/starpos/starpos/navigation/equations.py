@@ -498,9 +498,10 @@ class Odometry:
         return self.velocity - (1 + motion.log_scale) * (forward + np.cross(motion.log_axes, forward))
 
     def sound(self, missed: np.ndarray) -> np.ndarray:
-        """Mask (N,) of the velocities within what most of them scatter, or should; missed (N, 3) m/s."""
+        """Mask (N,) of the velocities within what most of them scatter on each axis, or should; missed (N, 3) m/s."""
         off = np.abs(missed) / self.sigma[:, None]
-        return off.max(1) < OUTLIER_SIGMA * max(1.0, SIGMA_PER_MAD * float(np.median(off)))
+        usual = np.maximum(1.0, SIGMA_PER_MAD * np.median(off, axis=0))
+        return (off < OUTLIER_SIGMA * usual).all(1)
 
     def residuals(
         self, motion: Motion, missed: np.ndarray, keep: np.ndarray, vibration: float, n: int

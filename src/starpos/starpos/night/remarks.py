@@ -210,12 +210,16 @@ MISTAKES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
 @at_once
 @dataclass(frozen=True)
 class Near:
-    """A place, in rad, at which the instrument is said to be within some km; stated_by: for sentences."""
+    """A place, in rad, at which the instrument is said to be within some km.
+
+    stated_by: for sentences.  either_sign: whether its longitude may be counted to the west, as some programs do.
+    """
 
     latitude: float
     longitude: float
     km: float = NEAR_KM
     stated_by: str = "--near"
+    either_sign: bool = False
 
     def km_from(self, latitude: float, longitude: float) -> float:
         """Distance in km, on a sphere, to a place in rad."""
@@ -242,17 +246,21 @@ def apart_m(a: tuple[float, float], b: tuple[float, float]) -> float:
 def _far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequence[Leaning]) -> str:
     """Say that a fix lies far from a place, and which mistake would explain it; '' if it does not."""
     km = near.km_from(fix.latitude, fix.longitude)
-    sigma_m = float(np.sqrt(np.diag(fix.covariance)[:2].max()))
-    if km <= near.km + FAR_SIGMA * sigma_m / 1000:
+    within_km = near.km + FAR_SIGMA * float(np.sqrt(np.diag(fix.covariance)[:2].max())) / 1000
+    if km <= within_km:
         return ""
     told = f"the place is {km:.0f} km from {near.stated_by}, and should be within {near.km:g} km"
+    ahead_h = _hours_ahead(near, fix)
+    hours = f"its times may be {abs(ahead_h):g} h {'ahead of' if ahead_h > 0 else 'behind'} UTC"
+    other_side = replace(near, longitude=-near.longitude)
+    if near.either_sign and other_side.km_from(fix.latitude, fix.longitude) <= within_km:
+        return f"{told}: {hours}, or the header counts longitudes to the west" if ahead_h else ""
     for name, places in _places(mounting, frames):
         off = [near.km_from(*place) for place in places]
         if max(off) <= near.km:
             return f"{told}: with {name} it would be {max(off):.0f} km from there: check the tilts"
-    if ahead_h := _hours_ahead(near, fix):
-        side = "ahead of" if ahead_h > 0 else "behind"
-        return f"{told}: its times may be {abs(ahead_h):g} h {side} UTC: check the clock of the camera"
+    if ahead_h:
+        return f"{told}: {hours}: check the clock of the camera"
     return f"{told}: check the times (UTC), the tilts and A3"
 
 

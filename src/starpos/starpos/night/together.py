@@ -87,7 +87,8 @@ class Gathered:
                 self.marks_deg.append(answer.stars.gps_deg)
             if answer.stars is not None and answer.stars.site_deg is not None and self.site is None:
                 latitude, longitude = np.radians(answer.stars.site_deg).tolist()
-                self.site = Near(latitude, longitude, stated_by=f"the header's {answer.stars.site_cards}")
+                stated_by = f"the header's {answer.stars.site_cards}"
+                self.site = Near(latitude, longitude, stated_by=stated_by, either_sign=True)
         if s.at_place:
             self.headings.append(s)
         if s.circle is not None:
@@ -134,11 +135,10 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
             mounting = given.mounting
         said += [] if whole is None else [remarks.of_table(fixes, whole, given)]
         said += [remarks.of_copies(fixes)] if given.has_level_inside else []
-    if near is None and (site := gathered.site) is not None:
-        # programs differ in the sign of the longitude
-        sides = site, replace(site, longitude=-site.longitude)
-        near = min(sides, key=lambda side: side.km_from(place.latitude, place.longitude))
-    said += [remarks.of_marks(place, gathered.marks_deg), *doubts(fixes, place, mounting, near)]
+    said += [
+        remarks.of_marks(place, gathered.marks_deg),
+        *doubts(fixes, place, mounting, near or gathered.site),
+    ]
     return Together(whole, why_not, tuple(filter(None, said)))
 
 

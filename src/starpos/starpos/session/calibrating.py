@@ -159,14 +159,15 @@ LATE_FRAMES = 3
 # A calibration replaces one that the solver has found itself only if its error is smaller by this factor.
 BETTER = 0.8
 OF_CALIBRATION = {"misalignment", "misalignment_stddev", "calibration_url"}
-OF_AVERAGE = OF_CALIBRATION | {
+# parameters by which A3 or the level's errors become others
+OF_MOUNTING = OF_CALIBRATION | {"inclinometer.model"}
+OF_AVERAGE = OF_MOUNTING | {
     "self_calibration",
     "refraction.pressure",
     "refraction.temperature",
     "refraction.humidity",
     "refraction.wavelength",
     "clock_stddev",
-    "inclinometer.model",
     "tilt_stddev",
 }
 

@@ -30,7 +30,7 @@ from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.recording.topics import ALL_INPUTS, CAMERA_INFO, NAV_SAT_FIX, STARS, TILT, TRAILS
 from starpos.session import reports
-from starpos.session.calibrating import OF_AVERAGE, Calibrating, Seen
+from starpos.session.calibrating import OF_AVERAGE, OF_MOUNTING, Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.deflection import LiveDeflection
 from starpos.session.driver import Answered, Averaged, Changes, Heard, Jobs, Log, Now, Output, Sent, refusing
@@ -185,8 +185,12 @@ class SolverSession:
         """Apply a change of these parameters."""
         if "clock_stddev" in names:
             self.doubt.clear()
-        if names & OF_AVERAGE:
+        if names & OF_MOUNTING:
             self._level.clear()
+        elif names & OF_AVERAGE:
+            self._level.begin_anew()
+        if self.latest is not None:
+            self.latest = replace(self.latest, refused=None)
         self.calibrating.parameters_set(names)
         self.deflection.parameters_set(names)
         self.instrument.remake()
@@ -416,10 +420,9 @@ class SolverSession:
                 return frame, answer
             return _refused(frame, answer, reports.OTHER_LEVEL)
         frame = replace(frame, stars=replace(frame.stars, clock_stddev_s=self.doubt.seconds), doubted=True)
-        if self.doubt.leans_otherwise:
-            return _refused(frame, answer, reports.OTHER_TILTS)
         known = self._question(frame, hint=answer.hint, until_s=AT_ONCE_S, known=answer.found)
-        return frame, self._answer(frame, known)
+        answer = self._answer(frame, known)
+        return _refused(frame, answer, reports.OTHER_TILTS) if self.doubt.leans_otherwise else (frame, answer)
 
     def _taught(self, frame: Waiting, answer: Solution, compared: bool) -> Answered:
         """The answer to a frame, with gnss.use by what GNSS has taught; compared: with GNSS's place of its time too."""
@@ -505,8 +508,8 @@ class SolverSession:
 
 
 def _refused(frame: Waiting, answer: Solution, why: str) -> tuple[Waiting, Solution]:
-    """A frame whose level earlier frames contradict, and its answer: its stars alone."""
-    refused = replace(answer, status=Status.NO_TILT, message=why, fix=None)
+    """A frame whose level earlier frames contradict, and its answer: what needs no level."""
+    refused = replace(answer, status=Status.NO_TILT, message=why, fix=None, tilt=None, circle=None)
     return replace(frame, doubted=True, refused=refused), refused
 
 

@@ -211,6 +211,11 @@ class LevelDoubt:
         self._other: Fix | None = None
         self._others = 0
 
+    def begin_anew(self) -> None:
+        """Take the next fix as a pose's first, as the air is another; a lasting doubt stays."""
+        if self._others < LASTING:
+            self.clear()
+
     def contradicts(self, fix: Fix, stated_s: float) -> bool:
         """Take a fix; whether its level contradicts the one that counts.  stated_s: 1 sigma of its time."""
         first = self._first

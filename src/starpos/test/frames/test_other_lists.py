@@ -80,5 +80,7 @@ def test_a_site_of_the_header_is_said_where_one_is_wanted(tmp_path):
     assert stated_site([str(path)]).endswith(
         "SITELAT +47 06 and SITELONG -11.3: if that is right, give it (east is positive)"
     )
+    assert read_frame(path).site_deg == pytest.approx((47.1, -11.3))
     path.write_text(f"{HEAD}x,y,flux\n1,2,3\n")
+    assert read_frame(path).site_deg is None
     assert stated_site([str(path)]) == stated_site(["none.csv"]) == stated_site([]) == ""

@@ -14,6 +14,7 @@ from astropy.io import fits
 
 from starpos.frames.exif import CameraClock
 from starpos.frames.exposure import UNKNOWN_LATENCY_S
+from starpos.frames.header import site
 from starpos.frames.reading import read_frame, why_no_time
 from starpos_testing.lacking import needs
 from starpos_testing.skies import raws
@@ -162,3 +163,30 @@ def test_a_cameras_picture_says_when_how_long_how_large_and_whether_it_was_cropp
     assert frame.mid_unix_s == pytest.approx(unix(start[:23]) + exposure_s / 2, abs=1e-3)
     assert frame.rough_focal_px == (focal_px if focal_px is None else pytest.approx(focal_px, rel=1e-4))
     assert (frame.origin_px is not None) == cropped
+
+
+SITES = [
+    ({"SITELAT": 47.1, "SITELONG": -11.3}, (47.1, -11.3)),
+    ({"SITELAT": "+47 06", "SITELONG": "-11:18:00"}, (47.1, -11.3)),
+    ({"LAT-OBS": "S33 52 12", "LONG-OBS": "151.2 E"}, (-33.87, 151.2)),
+    ({"LAT-OBS": "44.5 N", "LONG-OBS": "W 8.2"}, (44.5, -8.2)),
+    ({"OBSGEO-B": 50.0, "OBSGEO-L": 350.0}, (50.0, 350.0)),
+    # programs leave 0, 0 for none
+    ({"SITELAT": 0.0, "SITELONG": 0.0, "LAT-OBS": 44.5, "LONG-OBS": 8.2}, (44.5, 8.2)),
+    ({"SITELAT": "home", "SITELONG": 8.2, "LAT-OBS": 44.5, "LONG-OBS": 8.2}, (44.5, 8.2)),
+    ({"SITELAT": 0, "SITELONG": 0}, None),
+    ({"SITELAT": 95, "SITELONG": 8}, None),
+    ({"SITELAT": "", "SITELONG": "", "LAT-OBS": None}, None),
+    ({"SITELAT": 44.5}, None),
+    ({"SITELAT": "nan", "SITELONG": "nan"}, None),
+]
+
+
+@pytest.mark.parametrize(("header", "deg"), SITES)
+def test_the_site_is_of_the_first_cards_that_state_one(header, deg):
+    found = site(header)
+    if deg is None:
+        assert found == {}
+    else:
+        assert found["site_deg"] == pytest.approx(deg)
+        assert found["site_cards"].startswith(list(header)[-2])

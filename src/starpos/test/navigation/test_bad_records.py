@@ -102,6 +102,13 @@ def test_single_wild_velocities_are_left_out_and_their_neighbours_stay(record):
     assert nees(voyage, record) < 16 and voyage.left_out["velocities"] == number
 
 
+def test_a_log_that_is_worse_on_one_axis_loses_few_velocities(record, rng):
+    """A wheel that measures the way ahead worse than stated, and that it neither slides nor jumps far better."""
+    noisy = navigated(with_velocity(record, lambda t, v: v + rng.normal(0, 1, v.shape) * [0.2, 0.0, 0.0]))
+    assert nees(noisy, record) < 16
+    assert noisy.left_out["velocities"] < 0.05 * len(record.velocity.velocity)
+
+
 def test_velocities_worse_than_stated_widen_the_claim(record, rng):
     poor = navigated(with_velocity(record, lambda t, v: v + rng.normal(0, 0.2, v.shape)))
     assert nees(poor, record) < 16 and sigma_m(poor) > 1.2 * sigma_m(navigated(record))

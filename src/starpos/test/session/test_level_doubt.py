@@ -53,9 +53,14 @@ def test_one_that_is_carried_elsewhere_is_believed():
     assert not any(judged(STANDS, STANDS, turned(ZEROED), turned(ZEROED)))
 
 
-def test_confirmed_the_level_is_believed():
-    doubt = LevelDoubt()
-    for fix in (STANDS, STANDS, ZEROED):
-        doubt.contradicts(fix, STATED_S)
-    doubt.clear()
-    assert not doubt.contradicts(ZEROED, STATED_S)
+@pytest.mark.parametrize(("fixes", "believed"), [((ZEROED,), True), ((ZEROED, ZEROED), False)])
+def test_confirmed_the_level_is_believed_and_in_other_air_unless_the_doubt_lasts(fixes, believed):
+    for other_air in (False, True):
+        doubt = LevelDoubt()
+        for fix in (STANDS, STANDS, *fixes):
+            doubt.contradicts(fix, STATED_S)
+        if other_air:
+            doubt.begin_anew()
+        else:
+            doubt.clear()
+        assert doubt.contradicts(ZEROED, STATED_S) == (other_air and not believed)

@@ -9,7 +9,6 @@ export class Link {
   constructor(handlers) {
     this.handlers = handlers;
     this.heardAt = -Infinity;
-    this.closed = false;
   }
 
   get alive() {
@@ -19,13 +18,10 @@ export class Link {
   close() {
     clearTimeout(this.timer);
     this.source?.close();
-    this.closed = true;
   }
 
   open() {
-    if (this.closed) this.heardAt = performance.now(); // the page closed it: the node was not silent
     this.close();
-    this.closed = false;
     const source = new EventSource("/events");
     this.source = source;
     source.addEventListener("state", (event) => {
