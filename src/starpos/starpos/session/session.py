@@ -144,14 +144,20 @@ class SolverSession:
         return self._settings.solver(camera, self.calibrating.found, self._catalogue)
 
     def _other_calibration(self) -> None:
-        self._level.clear()
+        self._believe_level()
         self.instrument.remake()
+
+    def _believe_level(self) -> None:
+        """Believe the level again, also of the newest frame."""
+        self._level.clear()
+        if self.latest is not None:
+            self.latest = replace(self.latest, refused=None)
 
     def _other_camera(self) -> None:
         self._forget()
         self._search.other_camera()
         self._glows = Glows()
-        self._level.clear()
+        self._believe_level()
         if self.gnss is not None:
             self.gnss.other_camera()
         self.calibrating.camera_changed()
@@ -186,11 +192,9 @@ class SolverSession:
         if "clock_stddev" in names:
             self.doubt.clear()
         if names & OF_MOUNTING:
-            self._level.clear()
+            self._believe_level()
         elif names & OF_AVERAGE:
             self._level.begin_anew()
-        if self.latest is not None:
-            self.latest = replace(self.latest, refused=None)
         self.calibrating.parameters_set(names)
         self.deflection.parameters_set(names)
         self.instrument.remake()

@@ -11,7 +11,7 @@ from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.night.remarks import Near, doubts
 
 LATITUDE = np.radians(48.0)
-# where the place of a clock so many hours ahead lies as far west as the site lies east
+# site and hours: the place of a clock that is ahead by them lies as far west as the site lies east
 EITHER = {(7.45, 1), (7.59, 1), (15.0, 2)}
 
 
