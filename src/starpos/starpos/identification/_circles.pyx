@@ -230,9 +230,14 @@ def binned(
                 bin[kept] = bin_of(code[0], code[1], code[2])
                 kept += 1
     of = of[:kept]
-    order = np.argsort(of, kind="stable")
     starts = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=bins))]).astype(np.int32)
-    return made[1][order], made[2][order].view(bool), made[0][order], starts
+    order = np.argsort(of, kind="stable")
+    # each column is dropped once it is in order: a node has little memory
+    columns = [made[1], made[2], made[0]]
+    made = of = bin = shape = corners = turns = None
+    for i in range(3):
+        columns[i] = columns[i][order]
+    return columns[0], columns[1].view(bool), columns[2], starts
 
 
 cdef inline double _half_chord(const double *a, const double *b) noexcept nogil:

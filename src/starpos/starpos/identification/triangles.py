@@ -121,8 +121,9 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
         triples.append(triples_of_circles(v[apart], centres, radius * half_diagonal, most))
         progress("star triangles", (k + 1) / (len(taken) + 1))
     longest = 2 * half_diagonal
-    brightest, others = (np.concatenate(column) for column in zip(*triples, strict=True))
-    first, others = distinct(brightest, others, len(apart))
+    first, others = distinct(*map(np.concatenate, zip(*triples, strict=True)), len(apart))
+    # a node has little memory
+    del triples
     corners, counter_clockwise, shape, bin_start = binned(
         v, apart.astype(np.int32), first, others, SHORTEST_SIDE * longest, longest, int(np.prod(BINS))
     )
