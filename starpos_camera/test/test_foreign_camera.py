@@ -2,6 +2,7 @@
 """The detector with other people's drivers: compressed, best effort, no Capture; one graph for all tests."""
 
 import signal
+from collections import deque
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 
+from starpos_camera.detector import STAMPS_KEPT, FrameTopics
 from starpos_interfaces.msg import StarArray
 from starpos_testing.nodes import Listener, Process
 
@@ -163,3 +165,24 @@ def test_a_reliable_publisher_is_heard_reliably_and_the_other_is_named(best_effo
     assert graph.shown(best_effort, raw(pixels)).stars
     status, out = graph.process.end(signal.SIGINT)
     assert status == 0 and why in out and "nothing says which moment" in out
+
+
+def test_a_frame_that_both_topics_bring_some_frames_apart_is_taken_once_and_again_in_the_next_pass():
+    taken = []
+    topics = object.__new__(FrameTopics)
+    topics._stamps = {kind: deque(maxlen=STAMPS_KEPT) for kind in (Image, CompressedImage)}
+    topics._raw_sends, topics._take = False, lambda message, _: taken.append(message.header.stamp.sec)
+
+    def message(kind, second):
+        made = kind()
+        made.header.stamp.sec = second
+        return made
+
+    for _ in range(2):
+        topics._raw_sends = False
+        for second in (1, 2, 3):
+            topics._pass_compressed(message(CompressedImage, second), {})
+        for second in (2, 3, 4, 5):
+            topics._pass_raw(message(Image, second), {})
+        topics._pass_compressed(message(CompressedImage, 5), {})
+    assert taken == [1, 2, 3, 4, 5] * 2

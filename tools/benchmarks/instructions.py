@@ -27,8 +27,8 @@ GATE = "ffi_call"
 # A name: columns, rows; stars. The second is the first with four pixels made one.
 FRAMES = {"21 Mpx": (SIZES[21], 315), "5 Mpx (21 binned 2 x 2)": ((2808, 1872), 315), "2 Mpx": (SIZES[2], 30)}
 # A node's work on a frame besides detection, or without it, in million instructions a megapixel. It is not counted, but
-# derived from the CPU time of the nodes in docs/evidence/speed.md, less detection's, at 7.4 instructions a ns as
-# detection has.
+# derived from the CPU time of the nodes on a server (AMD EPYC, 26 November 2026), less detection's, at 7.4 instructions a
+# ns as detection had there.
 NODES = {
     "node `camera_detector`": (True, 30),
     "node `detector` beside `camera`": (True, 35),

@@ -2,8 +2,9 @@
 """The thread behind the nodes, without ROS."""
 
 import threading
+from types import SimpleNamespace
 
-from starpos_common.worker import Worker
+from starpos_common.worker import JobRunner, Worker
 from starpos_testing.patience import WAIT_S
 
 
@@ -65,3 +66,20 @@ def test_stop_waits_for_the_running_job_only():
 
 def test_stop_before_start():
     Worker(lambda job: job, lambda: None, "test").stop()
+
+
+def test_a_defect_in_what_takes_an_outcome_is_logged_and_the_node_goes_on():
+    ended, said, delivered = threading.Event(), [], []
+    node = SimpleNamespace(
+        create_guard_condition=lambda _: SimpleNamespace(trigger=ended.set),
+        get_logger=lambda: SimpleNamespace(error=said.append),
+    )
+    runner = JobRunner(node, lambda: delivered.append(True))
+
+    def take(outcome):
+        raise KeyError("defect")
+
+    runner.run(lambda: 1, take)
+    assert ended.wait(WAIT_S)
+    runner._on_ended()
+    assert "KeyError: 'defect'" in said[0] and delivered == [True] and not runner.busy

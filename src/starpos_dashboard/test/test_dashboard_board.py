@@ -143,6 +143,15 @@ def test_lights_are_the_newest_of_their_name_and_bounded():
     assert len(b.as_json(0.0, 15.0)) < board.LIGHTS * 600
 
 
+def test_nodes_that_get_a_light_later_are_silent_since_then():
+    now = [0.0]
+    b = Board(values := ALL | {"lights": "solver"}, clock=lambda: now[0])
+    now[0], values["lights"] = 100.0, "solver, camera"
+    assert {light["age"] for light in told(b)["lights"]} == {0.0}
+    now[0] = 103.0
+    assert {light["age"] for light in told(b)["lights"]} == {3.0}
+
+
 def test_only_lights_of_the_nodes_asked_for():
     b = Board(ALL | {"lights": "solver"})
     b.hear_diagnostics(said.diagnostics(("solver: A", 0, ""), ("wheels: B", 2, "")))

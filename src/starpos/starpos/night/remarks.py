@@ -251,16 +251,18 @@ def _far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequ
         return ""
     told = f"the place is {km:.0f} km from {near.stated_by}, and should be within {near.km:g} km"
     ahead_h = _hours_ahead(near, fix)
-    hours = f"its times may be {abs(ahead_h):g} h {'ahead of' if ahead_h > 0 else 'behind'} UTC"
+    side = "ahead of" if ahead_h > 0 else "behind"
     other_side = replace(near, longitude=-near.longitude)
     if near.either_sign and other_side.km_from(fix.latitude, fix.longitude) <= within_km:
-        return f"{told}: {hours}, or the header counts longitudes to the west" if ahead_h else ""
+        if not ahead_h:
+            return ""
+        return f"{told}: its times may be {abs(ahead_h):g} h {side} UTC, or the header counts longitudes to the west"
     for name, places in _places(mounting, frames):
         off = [near.km_from(*place) for place in places]
         if max(off) <= near.km:
             return f"{told}: with {name} it would be {max(off):.0f} km from there: check the tilts"
     if ahead_h:
-        return f"{told}: {hours}: check the clock of the camera"
+        return f"{told}: its times may be {abs(ahead_h):g} h {side} UTC: check the clock of the camera"
     return f"{told}: check the times (UTC), the tilts and A3"
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from starpos.averaging import elevation_axis
 from starpos.fix.solver import Solver
 from starpos.instrument.instrument import UNKNOWN_ARCSEC, Calibration
 from starpos.night.together import from_elevations
@@ -65,3 +66,19 @@ def test_tilts_that_all_scatter_widen_the_claim():
     found = answered(wild)
     assert doubts(found) == {"scatter"}
     assert wild.place_nees(found.together.average) < 14
+
+
+def test_an_axis_that_the_fit_leaves_at_the_border_of_what_the_frames_can_have_is_no_answer(
+    night, monkeypatch
+):
+    """The best axis brings a frame nearer to the zenith than any may be: the fit ends there, far from a minimum."""
+    solved, calls = elevation_axis._solved, []
+    monkeypatch.setattr(
+        elevation_axis, "_solved", lambda *a, **more: (calls.append(a), solved(*a, **more))[1]
+    )
+    answered(night, off_deg=-1.0, stated=UNKNOWN_ARCSEC)
+    a3, _, circles, _, ray, _ = first = calls[0]
+    up = np.array([c.up for c in circles])
+    begin, end = (np.sin(elevation_axis._seen(up, m @ ray)).min() for m in (a3, solved(*first).a3))
+    monkeypatch.setattr(elevation_axis, "MIN_SINE", begin + 0.01 * (end - begin))
+    assert end < begin and solved(*first) is None
