@@ -32,7 +32,7 @@ def test_a_camera_with_a_lag_nobody_told_finds_the_place_that_known_times_give(t
         lacks(lack[2], lack[1])
     assert tool.returncode == 0, out + error
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["solved"] == FRAMES and summary["frames"] >= 1
+    assert summary["solved"] >= FRAMES and summary["frames"] >= 1
     assert summary["sigmas_off"] < 4
     # The sky and the shutter of a busy machine may come late together, and the lag with them.
     assert math.hypot(summary["east_of_known_times_m"], summary["north_of_known_times_m"]) < 10
