@@ -69,6 +69,7 @@ class PlacelessFrame(FrameUnderWay):
         return cls(
             utc_unix_s=attitude.utc_unix_s,
             stamp_stddev_s=attitude.stamp_stddev_s,
+            clock_stddev_s=attitude.clock_stddev_s,
             camera=among_stars.then(earth_state(attitude.utc_unix_s).gcrs_to_itrs, ITRS),
         )
 
@@ -131,7 +132,11 @@ def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> Placeless
     except FixError as error:
         raise FixError(f"{stars.place}: {error}: left out") from None
     return PlacelessFrame(
-        utc_unix_s=mid_unix_s, stamp_stddev_s=stars.stamp_stddev_s, source=stars.place, camera=attitude
+        utc_unix_s=mid_unix_s,
+        stamp_stddev_s=stars.stamp_stddev_s,
+        clock_stddev_s=stars.clock_stddev_s,
+        source=stars.place,
+        camera=attitude,
     )
 
 
@@ -173,6 +178,7 @@ class SunFrame(FrameUnderWay):
         return cls(
             utc_unix_s=seen.utc_unix_s,
             stamp_stddev_s=seen.stamp_stddev_s,
+            clock_stddev_s=seen.clock_stddev_s,
             camera=Attitude(turn, turn @ seen.covariance @ turn.T, of=CAMERA, into=ITRS),
             ray=seen.ray,
             body=body,
@@ -221,7 +227,8 @@ def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitu
     a4, air = place.plumb_axes, vessel.atmosphere
     against_earth, by_refraction = frame.under(a4[2], air)
     seen = against_earth.then(a4, ENU)
-    late_s = [frame.stamp_stddev_s, vessel.clock_stddev_s, earth_orientation(frame.utc_unix_s).ut1_sigma_s]
+    ut1_sigma_s = earth_orientation(frame.utc_unix_s).ut1_sigma_s
+    late_s = [frame.stamp_stddev_s, vessel.clock_stddev_of([frame]), ut1_sigma_s]
     moved = zenith_moved(place.plumb[0])
     columns = np.column_stack([
         a4 @ by_refraction * air.relative_sigma,

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is known of instrument and vehicle before a voyage, with the laws of motion where nothing measures the speed."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
+from starpos.fix.sighting import Sighting
 from starpos.navigation.records import ImuModel
 from starpos.tables import packaged
 
@@ -54,7 +56,8 @@ class Vessel:
     """An instrument on a vehicle.
 
     vehicle: a name in LAWS, or None for anything.  model: of the IMU.
-    camera_to_body (3, 3), mount_stddev: as believed, and rad an axis.  clock_stddev_s: of the stamps against UTC.
+    camera_to_body (3, 3), mount_stddev: as believed, and rad an axis.
+    clock_stddev_s: of the stamps against UTC, at least; a frame may state that its clock is worse.
     drift_stddev: m/s an axis, of water or air against the ground, where velocities are measured against these.
     height_m, height_stddev_m: above the ellipsoid; by itself anywhere on land.
     """
@@ -73,6 +76,10 @@ class Vessel:
     def law(self) -> MotionLaw:
         """How its speed changes where nothing measures it."""
         return ANYTHING if self.vehicle is None else LAWS[self.vehicle]
+
+    def clock_stddev_of(self, frames: Iterable[Sighting]) -> float:
+        """The error (s, 1 sigma) of the clock that stamped these frames, which they share."""
+        return max(self.clock_stddev_s, *(f.clock_stddev_s for f in frames))
 
     @property
     def carried(self) -> MotionLaw:

@@ -486,9 +486,10 @@ def adjust_voyage(
     adjustment = Adjustment(within, nodes, Pieces.cut(imu, nodes), velocity, vessel, imu.vibration)
     motion, solution = adjustment.settle(progress)
     stamp_s = float(np.median([f.stamp_stddev_s for f in within]))
+    clock_s = vessel.clock_stddev_of(within)
     return Voyage(
         fixes=tuple(
-            fix_of(motion, k, solution.covariance[k], vessel.clock_stddev_s, stamp_s) if there else None
+            fix_of(motion, k, solution.covariance[k], clock_s, stamp_s) if there else None
             for k, there in zip(np.searchsorted(nodes, times), inside, strict=True)
         ),
         faults=(*imu.faults, *(() if velocity is None else velocity.faults), *adjustment.faults),
@@ -500,7 +501,7 @@ def adjust_voyage(
             covariance=solution.covariance[-1],
             model=adjustment.model,
             law=adjustment.law,
-            clock_stddev_s=vessel.clock_stddev_s,
+            clock_stddev_s=clock_s,
             stamp_stddev_s=stamp_s,
         ),
     )

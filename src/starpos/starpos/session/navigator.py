@@ -7,7 +7,7 @@ last one on.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -47,8 +47,9 @@ class NavigatorSettings(NodeSettings):
         "imu_model": lambda name: read_imu_model(path_of(name)),
     }
 
-    def vessel(self, clock_stddev_s: float) -> Vessel:
-        """Instrument and vehicle, of which the frames' clock states its error."""
+    @property
+    def vessel(self) -> Vessel:
+        """Instrument and vehicle."""
         values, known = self.values, self._known or ANY_INSTRUMENT
         clock = values["clock_stddev"]
         height = values["altitude"]
@@ -63,7 +64,7 @@ class NavigatorSettings(NodeSettings):
             camera_to_body=np.asarray(known.link_to_camera, float).T,
             mount_stddev=float(np.radians(values["mount_stddev"])),
             atmosphere=self.atmosphere,
-            clock_stddev_s=max(known.clock_stddev_s, clock_stddev_s) if np.isnan(clock) else clock,
+            clock_stddev_s=known.clock_stddev_s if np.isnan(clock) else clock,
             drift_stddev=values["drift_stddev"],
             **stated,
         )
@@ -121,7 +122,6 @@ class NavigatorSession:
         self._next_s = self._adjusted_s = -math.inf
         # of the newest frame that the estimate is made of
         self._seen_s = -math.inf
-        self._clock_stddev_s = 0.0
         self._gnss = ComparedPlaces()
         self._jobs.disown()
 
@@ -162,6 +162,9 @@ class NavigatorSession:
             attitude = message_to_attitude(message)
             self._check_time(attitude.utc_unix_s, now, "an attitude")
             assert attitude.utc_unix_s is not None
+            # If the user sets clock_stddev, it replaces the error that the camera's host states.
+            if not np.isnan(self._values["clock_stddev"]):
+                attitude = replace(attitude, clock_stddev_s=0.0)
             by_sun, place = attitude.ray is not None, None
             if by_sun or self._estimate is None or self._stars_missing:
                 place = self._place_at(attitude.utc_unix_s)
@@ -172,10 +175,9 @@ class NavigatorSession:
                 )
             frame = SunFrame.of(attitude, place) if by_sun and place else PlacelessFrame.of(attitude)
             self._recent.add_frame(frame)
-            self._clock_stddev_s = attitude.clock_stddev_s
             if place is not None and isinstance(frame, PlacelessFrame):
                 # the heading at a known place, while there is no fix
-                found = body_attitude(frame, place, self._settings.vessel(self._clock_stddev_s))
+                found = body_attitude(frame, place, self._settings.vessel)
                 return [Navigated(utc_unix_s=frame.utc_unix_s, at_place=found)]
         return []
 
@@ -255,7 +257,7 @@ class NavigatorSession:
         if len(inside) < MIN_FRAMES or time_s - recent.readings.first_s < SHORTEST_S:
             return
         self._adjusted_s = time_s
-        vessel = self._settings.vessel(self._clock_stddev_s)
+        vessel = self._settings.vessel
         sun = next((f for f in reversed(inside) if isinstance(f, SunFrame)), None)
         self._jobs.run(recent.job(vessel), lambda made: self._adjusted(made, sun))
 

@@ -2,17 +2,20 @@
 """`starpos navigate` on a drive of 80 s: star lists under the catalogue's sky, an IMU's table, odometry."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 from cli_calls import AIR, WIDE, objects
 
 from starpos.earth.refraction import Atmosphere
+from starpos.frames.reading import read_frame
 from starpos.instrument.instrument import AxisDoubt, Instrument
-from starpos.night.under_way import vessel_of
+from starpos.night.reading import Instruments
+from starpos.night.under_way import vessel_of, voyage_frame
 from starpos_testing.command_line import run
 from starpos_testing.skies.folders import write_drive
+from starpos_testing.skies.scenes import FOCAL_PX
 from starpos_testing.voyages import INDUSTRIAL, made
 
 KEYS = {"file", "utc_unix_s", "latitude", "longitude", "heading", "covariance", "velocity", "gyro_bias", "accel_bias",
@@ -130,6 +133,12 @@ def test_crops_of_a_sensor_of_which_nobody_says_the_size_are_refused_as_of_a_mou
     # 2000 px are 23 deg here
     assert (status, out, len(errors)) == (2, "", 1)
     assert "size is not stated" in errors[0] and "an error of the mount" in errors[0]
+
+
+def test_a_frame_keeps_the_errors_of_its_stamp_and_its_clock(voyage):
+    stars = replace(read_frame(min(voyage[0].glob("stars_*.csv"))), stamp_stddev_s=0.1, clock_stddev_s=20.0)
+    seen = voyage_frame(Instruments(Instrument(FOCAL_PX)), stars).sighting
+    assert (seen.stamp_stddev_s, seen.clock_stddev_s) == (0.1, 20.0)
 
 
 def test_an_axis_that_nobody_knows_widens_the_mount():

@@ -17,10 +17,11 @@ from navigator_calls import (
     output_nees,
     velocity_message,
 )
-from voyage_calls import navigated
+from voyage_calls import EARTH_M, navigated
 
 from starpos import rotation
 from starpos.earth.ellipsoid import enu_axes
+from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
@@ -271,6 +272,29 @@ def test_at_a_known_place_there_is_a_heading_before_a_fix(record, known_by):
     # the mount's error is the same in all, 1 deg; all others are far below
     assert np.mean(nees) < 9 and np.sqrt(seen.covariance[2, 2]) < np.radians(1.01)
     assert np.std([np.sqrt(x) for x in nees]) < 0.2
+
+
+@pytest.mark.parametrize("stated_s", [np.nan, 1e-4], ids=["unstated", "stated"])
+def test_a_frames_clock_counts_in_a_heading_and_in_a_fix_until_the_user_states_a_better_one(
+    record, model, stated_s
+):
+    site = {
+        "site.latitude": np.degrees(record.latitude[0]),
+        "site.longitude": np.degrees(record.longitude[0]),
+    }
+    navigator = Navigator(imu_model=model, clock_stddev=stated_s, mount_stddev=0.01, **site)
+    messages = [(f.utc_unix_s + 0.5, attitude_message(f)) for f in record.frames]
+    for _, message in messages:
+        message.clock_stddev = 20.0
+    others = [e for e in events_of(record) if e[1] != "attitude"]
+    navigator.play([*others, *((t, "attitude", message) for t, message in messages)])
+    # 20 s are 0.08 deg of the Earth's turn
+    headings = [o.at_place.angles_covariance[0, 0] for o in navigator.outputs if o.at_place is not None]
+    fixes = [o.fix.covariance[0, 0] for o in navigator.outputs if o.fix is not None]
+    turn, latitude = 0.9 * 20.0 * ROTATION_RAD_S, record.latitude[0]
+    assert headings and fixes
+    assert np.isnan(stated_s) == (min(headings) > (turn * np.sin(latitude)) ** 2)
+    assert np.isnan(stated_s) == (min(fixes) > (turn * EARTH_M * np.cos(latitude)) ** 2)
 
 
 def test_a_heading_at_a_known_place_claims_what_it_errs_by_when_the_mount_is_known(record):

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Voyages of the reference against their truth: exact ones anywhere on Earth, and the claims of those with errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from voyage_calls import errors, navigated, nees, sigma_m
+from voyage_calls import errors, navigated, nees, sigma_m, vessel
 
+from starpos.navigation.voyage import adjust_voyage
 from starpos_testing.voyages import CAMERA_TO_BODY, INDUSTRIAL, TACTICAL, made
 
 
@@ -44,6 +47,20 @@ def test_without_velocity_the_claim_is_wide_and_holds(kind):
     record = made(kind, 120, 4, rate_hz=25)
     voyage = navigated(record, kind, velocity=False)
     assert nees(voyage, record) < 16 and sigma_m(voyage) > 1000
+
+
+def test_frames_whose_clock_is_worse_than_the_instruments_widen_the_claim():
+    """A clock that is 1 s off puts all places 464 m east or west at the equator."""
+    record = made("rover", 60, 3, rate_hz=25, latitude_deg=0.0)
+    late = [replace(f, clock_stddev_s=1.0) for f in record.frames]
+    own, by_frames = (
+        adjust_voyage(frames, record.imu, record.velocity, vessel()) for frames in (record.frames, late)
+    )
+    stated = adjust_voyage(record.frames, record.imu, record.velocity, replace(vessel(), clock_stddev_s=1.0))
+    east, east_late = (v.fixes[-1].covariance[0, 0] for v in (own, by_frames))
+    assert east_late - east == pytest.approx(464.6**2, rel=0.01)
+    assert by_frames.fixes[-1].covariance == pytest.approx(stated.fixes[-1].covariance)
+    assert by_frames.last.clock_stddev_s == 1.0
 
 
 def test_a_vehicle_that_nobody_names_has_a_wider_claim():
