@@ -18,13 +18,24 @@ from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.sensors import SCA100T_CALIBRATED
 from starpos.instrument.tilt_log import TiltsByTime
 from starpos.sky.site import camera_to_enu
+from starpos.units import ARCSEC
 from starpos_testing.skies.scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 
 
-def turned(catalogue, rng, headings, misalignment=(1.5, -2.0, 130.0), zero_deg=(0.2, -0.1), lean=0.0):
+def turned(
+    catalogue,
+    rng,
+    headings,
+    misalignment=(1.5, -2.0, 130.0),
+    zero_deg=(0.2, -0.1),
+    lean=0.0,
+    cooling=None,
+    inclinometer=SCA100T_CALIBRATED,
+):
     """Frames at these azimuths of an instrument with an unknown A3, its tilts, and the scene.
 
-    lean: by how many deg the axis of the turn is off the plumb line.
+    lean: by how many deg the axis of the turn is off the plumb line.  cooling: temperatures (K,) in deg C of the
+    inclinometer, the zeros' change in deg per deg C, and indices of the frames whose temperature is not known.
     """
     frames, tilts = [], {}
     for n, azimuth in enumerate(headings):
@@ -34,11 +45,15 @@ def turned(catalogue, rng, headings, misalignment=(1.5, -2.0, 130.0), zero_deg=(
         begin = START + 60.0 * n
         stars, tilt = stars_of(scene, catalogue, rng, begin), tilt_of(scene, rng, begin)
         frames.append(stars)
-        zero = np.radians(zero_deg)
+        zero, about = np.radians(zero_deg), {"utc_unix_s": stars.mid_unix_s}
+        if cooling is not None:
+            celsius, per_c, unmeasured = cooling
+            zero = zero + np.radians(per_c) * celsius[n]
+            about["temperature_c"] = np.nan if n in unmeasured else celsius[n]
         tilts[stars.mid_unix_s] = Tilt(
-            tilt.theta_x + zero[0], tilt.theta_y + zero[1], tilt.covariance, utc_unix_s=stars.mid_unix_s
+            tilt.theta_x + zero[0], tilt.theta_y + zero[1], tilt.covariance, **about
         )
-    solver = Solver(Instrument(FOCAL_PX, inclinometer=SCA100T_CALIBRATED), catalogue, scene.site.atmosphere)
+    solver = Solver(Instrument(FOCAL_PX, inclinometer=inclinometer), catalogue, scene.site.atmosphere)
     return turn(solver, frames, TiltsByTime(tilts)), scene
 
 
@@ -115,6 +130,21 @@ def test_the_place_of_an_instrument_whose_a3_nobody_knows(catalogue, rng, headin
     assert 150 / np.sqrt(len(headings)) < sigma < 900 / np.sqrt(len(headings)) * 2
     assert metres < 4 * sigma
     assert answer.plumb_stddev_arcsec < 40
+
+
+@pytest.mark.parametrize(
+    "unmeasured", [(), (2,), range(24)], ids=["all measured", "one missing", "none measured"]
+)
+def test_a_claim_holds_while_the_inclinometer_cools(catalogue, rng, unmeasured):
+    """By 6 C an hour, with 20 arcsec per deg C: 1.5 km in the 24 minutes of a turn."""
+    errors = replace(SCA100T_CALIBRATED, temperature_rad_per_c=20 * ARCSEC)
+    sigmas = []
+    for _ in range(4):
+        cooling = np.linspace(12.0, 9.6, 24), rng.normal(0, 20 / 3600, 2), unmeasured
+        answer, scene = turned(catalogue, rng, range(0, 360, 15), cooling=cooling, inclinometer=errors)
+        sigmas.append(miss(average(answer.fixes), scene)[1])
+    # two degrees of freedom: the mean square of four is below 6.7 but for once in a thousand
+    assert np.mean(np.square(sigmas)) < 6.7, sigmas
 
 
 def test_the_plumb_line_is_where_it_was_put(catalogue, rng):
