@@ -106,34 +106,37 @@ def answer_frame(solver: Solver, question: Question) -> Sight:
     q, disc = question, question.stars.disc
     if disc is None or (q.tilts is None and q.places is None):
         return _by_stars(solver, q)
-    found = solver.identify(q.stars, q.predicted)
-    if not found.lost:
-        return _by_stars(solver, replace(q, known=found.found))
+    searched = solver.identify(q.stars, q.predicted)
+    if not searched.lost:
+        return _by_stars(solver, replace(q, known=searched.found), searched)
     by_day = Sight(q.stars, by_sun(solver, q.stars, disc, q.tilts, q.places))
     if by_day.solution.ok:
         return by_day
-    by_night = _by_stars(solver, q)
+    by_night = _by_stars(solver, q, searched)
     return by_day if by_night.solution.lost else by_night
 
 
-def _by_stars(solver: Solver, question: Question) -> Sight:
-    """The answer to a frame by its stars."""
+def _by_stars(solver: Solver, question: Question, searched: Solution | None = None) -> Sight:
+    """The answer to a frame by its stars; searched: as of `identify_every_way`."""
     q = question
-    sight = identify_every_way(solver, q) if q.tilts is None else _solved(solver, q, q.tilts)
+    sight = identify_every_way(solver, q, searched) if q.tilts is None else _solved(solver, q, q.tilts)
     if q.places is None:
         return sight
     answer = sight.solution
     if answer.found is None and answer.status in UNASKED:
-        sight = identify_every_way(solver, q)
+        sight = identify_every_way(solver, q, searched)
         if sight.found is None:
             return sight
         answer = replace(sight.solution, status=answer.status, message=answer.message)
     return replace(sight, solution=placed(solver, sight.stars, answer, q.places))
 
 
-def identify_every_way(solver: Solver, question: Question) -> Sight:
-    """Identify a frame; its stars that identified it, or the given ones with the first answer if none did."""
-    first = solver.identify(question.stars, question.predicted)
+def identify_every_way(solver: Solver, question: Question, searched: Solution | None = None) -> Sight:
+    """Identify a frame; its stars that identified it, or the given ones with the first answer if none did.
+
+    searched: what the search among the given stars has answered; None before it.
+    """
+    first = searched or solver.identify(question.stars, question.predicted)
     return _otherwise(solver, question, Sight(question.stars, first))
 
 

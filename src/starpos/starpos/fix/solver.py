@@ -506,7 +506,7 @@ FOCAL_STEP, FOCAL_TRIES = 1.055, 6
 def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> float | None:
     """The focal length in px at which a frame is identified, from 0.7 to 1.4 times the solver's; None without one.
 
-    No try is begun after until_s (time.monotonic).
+    With the solver's own it is not identified, which is not tried again. No try is begun after until_s (time.monotonic).
     Triangles are found by their angles, which hardly depend on the focal length, so the given field's triangles serve.
     """
     on = stars.select(stars.on_frame.nonzero()[0])
@@ -515,7 +515,7 @@ def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> 
     try:
         given, catalogue, triangles = solver.view(on.width, on.height, on.origin_px)
         sky = Sky.at(catalogue, triangles, on.mid_unix_s)
-        for k in sorted(range(-FOCAL_TRIES, FOCAL_TRIES + 1), key=abs):
+        for k in sorted({*range(-FOCAL_TRIES, FOCAL_TRIES + 1)} - {0}, key=abs):
             if time.monotonic() >= until_s:
                 break
             camera = given.scaled(FOCAL_STEP**k)

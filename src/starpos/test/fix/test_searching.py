@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from starpos.detection import second_look as ways
+from starpos.earth.place import Place
 from starpos.fix import searching
 from starpos.fix.searching import PART, Question, answer_frame, identify_every_way
 from starpos.fix.solution import Solution, Status
-from starpos.fix.solver import Solver
-from starpos.frames.frame import Frame, no_stars
+from starpos.fix.solver import Solver, focal_that_fits
+from starpos.frames.frame import Disc, Frame, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration, Instrument
@@ -93,21 +94,50 @@ def test_no_other_way_is_begun_when_the_time_is_over(frame):
     assert identified(Answering(lost), frame, no_stars(300, 200), until_s=0.0).solution is lost
 
 
-@pytest.mark.parametrize("tilts", [None, NO_TILTS], ids=["identified", "solved"])
-def test_no_way_is_tried_twice_on_the_same_stars(frame, tilts, monkeypatch):
-    stars = no_stars(300, 200)
+DISC = Disc(x=150.0, y=100.0, covariance=np.eye(2), radius_px=20.0, sharp=True)
+
+
+@pytest.mark.parametrize(
+    ("tilts", "disc", "first"),
+    [
+        (None, None, ["search"]),
+        (NO_TILTS, None, ["solve"]),
+        # the level's search is another one: refraction is removed first
+        (None, DISC, ["search"]),
+        (NO_TILTS, DISC, ["search", "solve"]),
+    ],
+    ids=["identified", "solved", "identified beside a disc", "solved beside a disc"],
+)
+def test_no_way_is_tried_twice_on_the_same_stars(frame, tilts, disc, first, monkeypatch):
+    stars = replace(no_stars(300, 200), disc=disc)
+    lost = Solution.failed(stars, Status.NOT_IDENTIFIED, "lost")
     others = [replace(stars, source=str(k)) for k in range(2)]
     monkeypatch.setattr(ways, "other_views", lambda frame, window: iter(others))
-    solver = Answering(*20 * [Solution.failed(stars, Status.NOT_IDENTIFIED, "lost")])
-    assert not answer_frame(solver, Question(item=frame, stars=stars, tilts=tilts)).solution.ok
-    assert len(solver.ways) == len(set(solver.ways)) == 12
-    first = "search" if tilts is None else "solve"
-    assert [way for way, source, _ in solver.ways if source == stars.source] == [
-        first,
-        "look",
-        "search",
-        "look",
-    ]
+    monkeypatch.setattr(searching, "by_sun", lambda *asked: lost)
+    solver = Answering(*20 * [lost])
+    places = None if disc is None else Place.on_ellipsoid(48.0, 11.0, height_m=0.0)
+    question = Question(item=frame, stars=stars, tilts=tilts, places=places)
+    assert not answer_frame(solver, question).solution.ok
+    assert len(solver.ways) == len(set(solver.ways)) == 11 + len(first)
+    tried = [way for way, source, _ in solver.ways if source == stars.source]
+    assert tried == [*first, "look", "search", "look"]
+
+
+def test_stars_beside_a_disc_that_are_identified_are_not_searched_again(frame):
+    stars = replace(no_stars(300, 200), disc=DISC)
+    lost = Solution.failed(stars, Status.NOT_IDENTIFIED, "lost")
+    seen = replace(lost, status=Status.OK, pointing=SimpleNamespace(log_odds=99.0), found=SimpleNamespace())
+    solver = Answering(seen, replace(lost, status=Status.OK))
+    assert answer_frame(solver, Question(item=frame, stars=stars, tilts=NO_TILTS)).solution.ok
+    assert solver.ways == [("search", stars.source, 1.0), ("solve", stars.source, seen.found)]
+
+
+def test_the_given_focal_length_is_not_tried_again(catalogue, left_half, monkeypatch):
+    tried = []
+    monkeypatch.setattr("starpos.fix.solver.field_of", lambda *field: tried.append(field[-1].fx))
+    monkeypatch.setattr("starpos.fix.solver.identify", lambda field, sky: None)
+    assert focal_that_fits(Solver(Instrument(FOCAL_PX), catalogue), left_half) is None
+    assert len(tried) == len(set(tried)) == 12 and FOCAL_PX not in tried
 
 
 def test_what_another_way_has_identified_is_not_searched_again(frame):
