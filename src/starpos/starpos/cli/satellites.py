@@ -107,11 +107,11 @@ def _look(args: argparse.Namespace, frames: list[str], trails: list[SatelliteTra
         elif isinstance(answer, Solution):
             complaints(path, answer.message)
         else:
-            sights[path], found = answer
-            if found.left_out:
-                complaints(path, found.left_out)
-            trails += [replace(t, track=number + k, file=path) for k, t in enumerate(found.trails)]
-            number += len(found.trails)
+            sights[path], found, left_out = answer
+            if left_out:
+                complaints(path, left_out)
+            trails += [replace(t, track=number + k, file=path) for k, t in enumerate(found)]
+            number += len(found)
     complaints.end()
     return sights
 

@@ -201,14 +201,12 @@ class Adjuster:
         )
         return answer, blocks, step
 
-    def fits(
-        self, place: np.ndarray, clock_s: float, covariance: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Log density (T,) of each trail at a place known by a covariance (6, 6), and its probability by chance."""
+    def fits(self, at: PlaceAdjustment) -> tuple[np.ndarray, np.ndarray]:
+        """Log density (T,) of each trail at a place that others gave, and its probability by chance."""
         none = np.zeros((len(self.time_stddev), 3))
         density, probability = np.full((2, len(none)), -np.inf)
-        for block in self._blocks(self.equations(place, clock_s, none), none, np.ones(len(none), bool)):
-            total = block.total + block.by_place @ covariance @ block.by_place.T
+        for block in self._blocks(self.equations(at.place, at.clock_s, none), none, np.ones(len(none), bool)):
+            total = block.total + block.by_place @ at.covariance @ block.by_place.T
             chi2 = float(block.residual @ np.linalg.solve(total, block.residual))
             density[block.trails] = -0.5 * (chi2 + np.linalg.slogdet(total)[1])
             probability[block.trails] = special.chdtrc(len(total), chi2)

@@ -147,9 +147,7 @@ class StoredOrbits:
     """The orbits of a file or folder, read again when it changes; SatelliteError where it has none at the beginning."""
 
     def __init__(self, path: Path | str) -> None:
-        self._path = Path(path)
-        self._files: list[tuple[str, int, int]] = []
-        self.trouble = ""
+        self._path, self.trouble = Path(path), ""
         self._orbits, _ = read_orbits(self._path)
         self._files = self._seen()
 

@@ -84,14 +84,6 @@ def _terms(xy: np.ndarray, order: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class FrameTrails:
-    """The usable trails of a frame, with tracks from 0, and a sentence on those left out; '': none."""
-
-    trails: tuple[SatelliteTrail, ...]
-    left_out: str = ""
-
-
-@dataclass(frozen=True, eq=False)
 class FrameSky:
     """The identified stars of a frame.
 
@@ -184,13 +176,13 @@ class FrameSky:
         shared = plate.variance(trail.ends)[:, None, None] * np.eye(2)
         return directions, turn @ own @ turn.transpose(0, 2, 1) + shared
 
-    def sighted(self, stars: Stars, found: Sequence[FrameTrail]) -> FrameTrails:
-        """Trails found on the frame of these stars, as seen from the ground, with the time of each end's row.
+    def sighted(self, found: Sequence[FrameTrail]) -> tuple[list[SatelliteTrail], str]:
+        """Trails found on the frame, as seen from the ground, with tracks from 0 and the time of each end's row.
 
         Of a trail that leaves the frame one end counts. One that is cut at both, or whose light is uneven, is left
-        out. FrameError with too few stars around a trail.
+        out, and a sentence, else '', says so. FrameError with too few stars around a trail.
         """
-        trails: list[SatelliteTrail] = []
+        stars, trails = self.stars, []
         for seen in found:
             if seen.cut.all() or not seen.steady:
                 continue
@@ -223,15 +215,20 @@ class FrameSky:
         cut = len(found) - len(trails) - uneven
         why = [f"{cut} leave the frame at both ends"] * (cut > 0) + [f"{uneven} flash or fade"] * (uneven > 0)
         left_out = f"{stars.place}: of {len(found)} trails {' and '.join(why)}: left out" if why else ""
-        return FrameTrails(tuple(trails), left_out)
+        return trails, left_out
 
 
-def trails_of(frame: Frame, stars: Stars, solution: Solution, catalogue: Catalogue) -> FrameTrails:
-    """The trails on a frame whose stars were identified. FrameError without a time, an exposure or enough stars."""
+def trails_of(
+    frame: Frame, stars: Stars, solution: Solution, catalogue: Catalogue
+) -> tuple[list[SatelliteTrail], str]:
+    """The trails on a frame whose stars were identified, and a sentence, else '', on those left out.
+
+    FrameError without a time, an exposure or enough stars.
+    """
     from starpos.detection.trails import find_trails
 
     sky = FrameSky.of(stars, solution, catalogue)
-    return sky.sighted(stars, find_trails(frame, stars, *sky.explained(catalogue)))
+    return sky.sighted(find_trails(frame, stars, *sky.explained(catalogue)))
 
 
 def _later_s(stars: Stars, rows: np.ndarray) -> np.ndarray:
