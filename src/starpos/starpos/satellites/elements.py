@@ -125,18 +125,13 @@ def read_orbits(path: Path | str) -> tuple[list[Orbit], list[str]]:
     except (OSError, UnicodeDecodeError) as e:
         reason = getattr(e, "strerror", None) or "it is no text"
         raise SatelliteError(f"{path}: no readable orbits ({reason}): {CURE}") from None
-    bad: list[str] = []
-    found = []
     try:
-        for orbit in _orbits(text):
-            if isinstance(orbit, Orbit):
-                found.append(orbit)
-            else:
-                bad.append(orbit)
+        read = list(_orbits(text))
     except (ValueError, ET.ParseError, csv.Error, StarposError) as e:
         raise SatelliteError(f"{path}: no readable orbits ({one_line(e)}): {CURE}") from None
     except ImportError:
         raise SatelliteError("orbits need the package sgp4: pip install sgp4") from None
+    found, bad = [o for o in read if isinstance(o, Orbit)], [o for o in read if isinstance(o, str)]
     if not found:
         raise SatelliteError(f"{path}: it has no orbits of satellites{f' ({bad[0]})' if bad else ''}: {CURE}")
     left = "1 is left out" if len(bad) == 1 else f"{len(bad)} are left out"
@@ -302,9 +297,11 @@ def _from_fields(row: Mapping[str, Any]) -> Orbit | str:
 
 
 def _of_states(
-    number: int, name: str, errors: OrbitErrors, rows: list[tuple[float, np.ndarray]]
+    text: str, name: str, errors: OrbitErrors, rows: list[tuple[float, np.ndarray]]
 ) -> Orbit | str:
-    """An ephemeris of times and places in GCRS."""
+    """An ephemeris of times and places in GCRS; text: the object's id."""
+    # other ids than catalogue numbers become a negative number of their own
+    number = int(text) if text.isdigit() else -sum(ord(c) << 8 * (k % 3) for k, c in enumerate(text))
     rows.sort(key=lambda row: row[0])
     times = np.array([row[0] for row in rows])
     places = np.array([row[1] for row in rows])
@@ -323,7 +320,9 @@ def _from_oem(text: str) -> Iterator[Orbit | str]:
         key, equals, value = (part.strip() for part in line.partition("="))
         if key == "META_START":
             if rows:
-                yield _of_states(_number_of(about), about.get("OBJECT_NAME", ""), CLASSES["operators"], rows)
+                yield _of_states(
+                    about.get("OBJECT_ID", ""), about.get("OBJECT_NAME", ""), CLASSES["operators"], rows
+                )
             about, rows = {}, []
         elif key.startswith("COVARIANCE_ST"):
             skipped = key == "COVARIANCE_START"
@@ -335,12 +334,6 @@ def _from_oem(text: str) -> Iterator[Orbit | str]:
             utc = _utc(_time(cells[0]), about.get("TIME_SYSTEM", "UTC"))
             place = np.array([float(cell) for cell in cells[1:4]]) * 1e3
             rows.append((utc, place @ _to_gcrs(about.get("REF_FRAME", ""), utc).T))
-
-
-def _number_of(about: Mapping[str, str]) -> int:
-    """The catalogue number, where the object's id is one; otherwise a negative number of the id's own."""
-    text = about.get("OBJECT_ID", "")
-    return int(text) if text.isdigit() else -sum(ord(c) << 8 * (k % 3) for k, c in enumerate(text))
 
 
 def _time(text: str) -> float:
@@ -402,7 +395,7 @@ def _from_sp3(text: str) -> Iterator[Orbit | str]:
             if place.any():
                 rows.setdefault(line[1:4], []).append((utc, place @ turn.T))
     for name, states in rows.items():
-        yield _of_states(_number_of({"OBJECT_ID": name}), name, CLASSES["precise"], states)
+        yield _of_states(name, name, CLASSES["precise"], states)
 
 
 def chosen(

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from starpos.earth.ellipsoid import enu_at_zenith
 from starpos.earth.orientation import earth_motion
 from starpos.errors import FrameError
 from starpos.fix.checks import check_exposure
@@ -19,7 +20,7 @@ from starpos.frames.exposure import UNKNOWN_SHUTTER
 from starpos.frames.frame import Frame, FrameTrail, Stars
 from starpos.instrument.camera import Camera
 from starpos.rotation import normalised
-from starpos.satellites.trails import SatelliteTrail, tangent_axes, turned
+from starpos.satellites.trails import SatelliteTrail, turned
 from starpos.sky.catalogue import Catalogue
 from starpos.units import SIGMA_PER_MAD
 
@@ -118,7 +119,7 @@ class FrameSky:
 
     def explained(self, catalogue: Catalogue) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pixels x, y and flux (N,) of all stars of the catalogue on the frame; of a wide frame, of the identified."""
-        stars, axes = self.stars, tangent_axes(self.directions.mean(0))
+        stars, axes = self.stars, enu_at_zenith(self.directions.mean(0))
         seen = self.directions @ axes.T
         if seen[:, 2].min() < COS_WIDEST or len(seen) < STARS_OF_ORDER[0]:
             return stars.x, stars.y, stars.flux
@@ -152,7 +153,7 @@ class FrameSky:
         """
         stars, middle = self.stars, trail.ends.mean(0)
         near = np.argsort(np.hypot(stars.x - middle[0], stars.y - middle[1]))[:MAX_STARS]
-        axes = tangent_axes(self.directions[near[: STARS_OF_ORDER[0]]].mean(0))
+        axes = enu_at_zenith(self.directions[near[: STARS_OF_ORDER[0]]].mean(0))
         near = near[self.directions[near] @ axes[2] > COS_FARTHEST]
         if len(near) < STARS_OF_ORDER[0]:
             raise FrameError(
@@ -168,7 +169,7 @@ class FrameSky:
             return normalised(np.column_stack([plate(pixel), np.ones(len(pixel))])) @ axes
 
         directions = at(trail.ends)
-        sky = np.stack([tangent_axes(d)[:2] for d in directions])
+        sky = np.stack([enu_at_zenith(d)[:2] for d in directions])
         step = np.eye(2) / 2
         change = np.stack([at(trail.ends + d) - at(trail.ends - d) for d in step], -1)
         turn = sky @ change

@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.earth.gravity import geodetic_place
+from starpos.earth.gravity import enu_at, geodetic_place
 from starpos.errors import SatelliteError
 from starpos.frozen import at_once
 from starpos.satellites.adjustment import Adjuster, KnownBefore, PlaceAdjustment
 from starpos.satellites.elements import Orbit
 from starpos.satellites.naming import FEWEST, Candidates, agreement, candidates, ways_of
-from starpos.satellites.orbits import enu_at
 from starpos.satellites.trails import SatelliteTrail
 
 # chi-squared of a candidate's place on the ground, from which its trail is looked at
@@ -64,15 +63,12 @@ class SatelliteFix:
 
 def locate(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: KnownBefore) -> SatelliteFix:
     """Name the trails and adjust the place; SatelliteError where they do not give one."""
-    fewest = FEWEST if prior.place is None else FEWEST - 1
+    fewest = FEWEST if prior.near is None else FEWEST - 1
     if len(trails) < fewest:
         raise SatelliteError(f"there are {len(trails)} trails: a place takes {fewest} or more")
     found = candidates(trails, orbits, prior)
-    known = found
-    if prior.place is not None and prior.covariance is not None:
-        east_north = enu_at(prior.place)[:2]
-        known = found.near(prior.place, east_north.T @ prior.covariance @ east_north)
-    agreed = agreement(known, orbits)
+    near = prior.near
+    agreed = agreement(found if near is None else found.and_place(near, prior.height_m))
     place, clock_s, rows = agreed.place, 0.0, agreed.members[agreed.members < len(found.trail)]
     seen_before: list[list[int]] = []
     while len(seen_before) < ROUNDS and rows.tolist() not in seen_before:

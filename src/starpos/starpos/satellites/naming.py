@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.earth.ellipsoid import ECCENTRICITY2, EQUATOR_RADIUS_M
-from starpos.earth.gravity import SPIN
+from starpos.earth.gravity import SPIN, enu_at, itrs_place
+from starpos.earth.place import Place
 from starpos.errors import SatelliteError
 from starpos.frozen import at_once
 from starpos.rotation import normalised
 from starpos.satellites.adjustment import KnownBefore
 from starpos.satellites.elements import Orbit, OrbitErrors
-from starpos.satellites.orbits import Moments, along_axes, enu_at
+from starpos.satellites.orbits import Moments, along_axes
 from starpos.satellites.trails import SatelliteTrail
 from starpos.units import DAY_S, UNIX_EPOCH_JD
 
@@ -57,13 +58,16 @@ class Candidates:
     places: np.ndarray
     covariance: np.ndarray
 
-    def near(self, place: np.ndarray, covariance: np.ndarray) -> "Candidates":
-        """These, and a place (3,) in ITRS that is known, as if a trail more had given it; covariance (3, 3): of it."""
+    def and_place(self, place: Place, height_m: float) -> "Candidates":
+        """These, and a place that is known, as if a trail more had given it."""
+        east_north = place.axes[:2]
+        covariance = east_north.T @ place.covariance @ east_north
+        itrs = itrs_place(place.latitude, place.longitude, height_m)
         return Candidates(
             trail=np.append(self.trail, self.trail.max(initial=0) + 1),
             way=np.append(self.way, 0),
             orbit=np.append(self.orbit, -1),
-            places=np.concatenate([self.places, place[None]]),
+            places=np.concatenate([self.places, itrs[None]]),
             covariance=np.concatenate([self.covariance, covariance[None]]),
         )
 
@@ -227,7 +231,7 @@ class Agreement:
     score: float
 
 
-def agreement(found: Candidates, orbits: Sequence[Orbit]) -> Agreement:
+def agreement(found: Candidates) -> Agreement:
     """The place on which most trails agree; SatelliteError if no place, or more than one, is far above chance."""
     trails = len(np.unique(found.trail))
     if trails < FEWEST:
@@ -242,20 +246,16 @@ def agreement(found: Candidates, orbits: Sequence[Orbit]) -> Agreement:
     tried = sorted(starts.tolist(), key=lambda k: -_fused(found, chance, k, steps=0).score)
     better = sorted((_fused(found, chance, k, steps=3) for k in tried[:FUSED]), key=lambda a: -a.score)
     best = better[0]
-    satellites = {orbits[k].number for k in found.orbit[best.members]}
-    if (
-        len(set(found.trail[best.members])) < FEWEST
-        or len(satellites) < 2
-        or best.score < ENOUGH + math.log(len(starts))
-    ):
+    # a known place counts as one
+    satellites = set(found.orbit[best.members].tolist())
+    if len(best.members) < FEWEST or len(satellites) < 2 or best.score < ENOUGH + math.log(len(starts)):
         raise SatelliteError(
             f"no place agrees with {FEWEST} trails: {trails} trails can be satellites of the orbits, but from different "
             "places: give orbits of that day, the height, or more trails"
         )
     for other in better[1:]:
         apart = float(np.linalg.norm(other.place - best.place))
-        mine = set(found.orbit[other.members].tolist()) & set(found.orbit[best.members].tolist())
-        if other.score > best.score - AHEAD and not mine:
+        if other.score > best.score - AHEAD and satellites.isdisjoint(found.orbit[other.members].tolist()):
             raise SatelliteError(
                 f"the trails agree with two places, {apart / 1e3:.0f} km apart: give --near, or more trails"
             )
