@@ -69,13 +69,14 @@ class Vessel:
     height_m: float = 500.0
     height_stddev_m: float = 2000.0
 
-    @property
-    def law(self) -> MotionLaw:
-        """How its speed changes where nothing measures it."""
-        return ANYTHING if self.vehicle is None else LAWS[self.vehicle]
-
-    @property
-    def carried(self) -> MotionLaw:
-        """How the drift changes where velocities are measured against water or air."""
+    def law(self, measured: bool) -> MotionLaw | None:
+        """How speed and drift change; measured: whether velocities are. None where the velocity over ground is known."""
+        if not measured:
+            return (
+                ANYTHING if self.vehicle is None else None if self.vehicle == PARKED else LAWS[self.vehicle]
+            )
+        if self.drift_stddev <= 0:
+            return None
+        # of the water or air against which they are measured
         walk = DRIFT_CHANGE * self.drift_stddev / DRIFT_CHANGE_S**0.5
         return replace(LAWS[PARKED], drift_stddev=self.drift_stddev, drift_walk=walk)

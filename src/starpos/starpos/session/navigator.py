@@ -12,8 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from starpos.earth.ellipsoid import enu_axes
-from starpos.earth.gravity import geodetic_place
+from starpos.earth.gravity import enu_at
 from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic
 from starpos.errors import GnssError, VoyageError
@@ -316,8 +315,7 @@ class NavigatorSession:
             self._origin = place
         if self._origin is None:
             return None, None
-        latitude, longitude, _ = (float(x) for x in geodetic_place(self._origin))
-        axes = enu_axes(latitude, longitude)
+        axes = enu_at(self._origin)
         return axes @ (place - self._origin), axes @ estimate.covariance[PLACE, PLACE] @ axes.T
 
     def _why_old(self, since_s: float) -> str:
