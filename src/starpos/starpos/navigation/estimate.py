@@ -150,17 +150,10 @@ BIAS, CAMERA, MOTION, WHOLE = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Observability:
-    """What is known of the place, 1 sigma an axis in m, and what is missing, '' where that is enough."""
+def observability(estimate: Estimate, measured: bool) -> tuple[float, str]:
+    """1 sigma of the place, m an axis, and a sentence on what is missing, '' where nothing is.
 
-    sigma_m: float
-    missing: str
-
-
-def observability(estimate: Estimate, measured: bool) -> Observability:
-    """Which unknown an estimate's place depends on: by how much its error would shrink if that were known.
-
+    That is the unknown which the place depends on most: by how much its error would shrink if it were known.
     measured: whether a velocity is measured, so that nothing else would determine it.
     """
     covariance = estimate.covariance
@@ -168,7 +161,7 @@ def observability(estimate: Estimate, measured: bool) -> Observability:
     place = level @ covariance[PLACE, PLACE] @ level.T
     sigma_m = float(np.sqrt(np.trace(place) / 2))
     if sigma_m < ENOUGH_M:
-        return Observability(sigma_m=sigma_m, missing="")
+        return sigma_m, ""
     n = estimate.unknowns
     speed = np.r_[VELOCITY, SPEED, DRIFT] if n == BY_LAW else np.r_[VELOCITY]
     groups = {BIAS: np.r_[ACCEL_BIAS], CAMERA: n + np.r_[MOUNT]} | ({} if measured else {MOTION: speed})
@@ -178,4 +171,4 @@ def observability(estimate: Estimate, measured: bool) -> Observability:
         told = across @ np.linalg.pinv(covariance[np.ix_(columns, columns)]) @ across.T
         share[sentence] = float(np.trace(told) / np.trace(place))
     most = max(share, key=lambda sentence: share[sentence])
-    return Observability(sigma_m=sigma_m, missing=most if share[most] > SHARE else WHOLE)
+    return sigma_m, most if share[most] > SHARE else WHOLE

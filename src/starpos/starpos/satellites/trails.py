@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.earth.ellipsoid import enu_at_zenith
-from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.earth.orientation import later
 from starpos.frozen import at_once
 
 
@@ -77,6 +77,5 @@ def turned(directions: np.ndarray, seconds: np.ndarray) -> np.ndarray:
 
     They turn about the axis of GCRS. The Earth's is 0.2 deg from it, which is 0.1 arcsec in 2 s.
     """
-    c, s = np.cos(ROTATION_RAD_S * seconds), np.sin(ROTATION_RAD_S * seconds)
-    x, y, z = directions.T
-    return np.stack([c * x - s * y, s * x + c * y, z], -1)
+    # as what stands still in the sky turns above the ground, the other way
+    return later(directions, -seconds)
