@@ -303,8 +303,7 @@ class Residuals(ArrayRows):
     def whitened(self, count: int) -> np.ndarray:
         """Equations (count, 3, n + m + 1) of all nodes, with zeros at nodes without one."""
         all_rows = np.zeros((count, *self.rows.shape[1:]))
-        if len(self.index):
-            all_rows[self.index] = np.linalg.solve(np.linalg.cholesky(self.covariance), self.rows)
+        all_rows[self.index] = np.linalg.solve(np.linalg.cholesky(self.covariance), self.rows)
         return all_rows
 
     def distance2(self, covariance: np.ndarray, left_out: np.ndarray) -> np.ndarray:

@@ -171,9 +171,7 @@ def centroids_of(residual: np.ndarray, stated: np.ndarray, placed_px: np.ndarray
 
 def _seen(stars: MatchedStars, state: EarthState, shutter: Shutter, height: int, mark: Place) -> np.ndarray:
     """Topocentric directions (N, 3) in ITRS, with the diurnal aberration, each when its row was exposed."""
-    itrs = state.to_itrs(stars.places)
-    if shutter.readout_s:
-        itrs = later(itrs, shutter.later_s(stars.xy[:, 1], height))
+    itrs = later(state.to_itrs(stars.places), shutter.later_s(stars.xy[:, 1], height))
     return rotation.normalised(itrs + station_velocity(mark.axes[2]))
 
 
