@@ -214,7 +214,7 @@ class Adjuster:
         return answer, *min(groups, key=lambda group: group[0])
 
     def fits(self, at: PlaceAdjustment) -> tuple[np.ndarray, np.ndarray]:
-        """Log density (T,) of each trail at a place that others gave, and its probability by chance."""
+        """Log densities (T,) of the trails at a place that others gave, and their probabilities by chance."""
         none = np.zeros((len(self.time_stddev), 3))
         density, probability = np.full((2, len(none)), -np.inf)
         for block in self._blocks(self.equations(at.place, at.clock_s, none), none, np.ones(len(none), bool)):

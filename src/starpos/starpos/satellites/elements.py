@@ -217,11 +217,8 @@ def _from_lines(text: str) -> Iterator[Orbit | str]:
     from sgp4.io import compute_checksum
 
     lines = [line.rstrip() for line in text.splitlines()]
-    before = ""
-    number = 0
-    while number < len(lines):
-        line = lines[number]
-        number += 1
+    numbered, before = enumerate(lines, 1), ""
+    for number, line in numbered:
         if not line.startswith("1 ") or len(line) < 60:
             before = line.removeprefix("0 ").strip()
             continue
@@ -229,10 +226,10 @@ def _from_lines(text: str) -> Iterator[Orbit | str]:
         if not second.startswith("2 ") or second[2:7] != line[2:7]:
             yield f"line {number}: no second line of the same satellite follows"
             continue
-        number += 1
+        next(numbered)
         wrong = [
             n
-            for n, text_ in ((number - 1, line), (number, second))
+            for n, text_ in ((number, line), (number + 1, second))
             if text_[68:69] != str(compute_checksum(text_))
         ]
         if wrong:
@@ -241,11 +238,11 @@ def _from_lines(text: str) -> Iterator[Orbit | str]:
             try:
                 record = Satrec.twoline2rv(line, second)
                 if record.ephtype == XP:
-                    yield f"line {number - 1}: its elements are for SGP4-XP, not for SGP4"
+                    yield f"line {number}: its elements are for SGP4-XP, not for SGP4"
                 else:
                     yield _of_record(record.satnum, before, record)
             except ValueError as e:
-                yield f"line {number}: {one_line(e)}"
+                yield f"line {number + 1}: {one_line(e)}"
         before = ""
 
 
@@ -406,7 +403,7 @@ def chosen(
     newer: also elements whose epoch is after that time.
     """
     best: dict[int, Orbit] = {}
-    left_out = {"newer": set[int](), "older": set[int]()}
+    too_new, too_old = set[int](), set[int]()
 
     def certain(orbit: Orbit) -> tuple[float, float]:
         days = abs(orbit.age_days(utc_unix_s))
@@ -414,19 +411,18 @@ def chosen(
 
     for orbit in sorted(orbits, key=certain):
         if not orbit.reaches(utc_unix_s):
-            left_out["older"].add(orbit.number)
+            too_old.add(orbit.number)
         elif orbit.ephemeris is None and orbit.epoch_unix_s > utc_unix_s and not newer:
-            left_out["newer"].add(orbit.number)
+            too_new.add(orbit.number)
         else:
             best.setdefault(orbit.number, orbit)
-    newer_only, older_only = (len(left_out[key] - set(best)) for key in ("newer", "older"))
     said = []
-    if newer_only:
+    if newer_only := len(too_new - set(best)):
         said.append(
             f"the elements of {newer_only} satellites are newer than {utc_text(utc_unix_s)}: they are used with "
             "--newer-elements alone"
         )
-    if older_only:
+    if older_only := len(too_old - set(best)):
         passive, manoeuvring = (CLASSES[name].max_age_days for name in ("passive", "manoeuvring"))
         said.append(
             f"the orbits of {older_only} satellites do not reach {utc_text(utc_unix_s)}, or are older than their class "
