@@ -17,7 +17,7 @@ from starpos.frozen import ArrayRows
 from starpos.navigation.preintegration import ERRORS, Pieces, Sums, summed
 from starpos.navigation.records import ImuModel, VelocityLog
 from starpos.navigation.vessel import MotionLaw, Vessel
-from starpos.rotation import cross_matrices, normalised, shortest_turn
+from starpos.rotation import cross_matrices, normalised
 from starpos.units import SIGMA_PER_MAD
 
 # Columns of a node: place m and velocity m/s in ITRS, attitude as a small rotation about ITRS's axes in rad, biases of
@@ -285,10 +285,12 @@ class StarAttitudes(ArrayRows):
 
     def nearest(self, camera: np.ndarray) -> np.ndarray:
         """The attitudes (F, 3, 3), each turned about its ray so that it is nearest to the camera's (F, 3, 3)."""
-        found = self.camera_to_itrs.copy()
-        for k in np.flatnonzero(~self.whole):
-            believed, seen = camera[k] @ self.rays[k], found[k] @ self.rays[k]
-            found[k] = shortest_turn(believed, seen) @ camera[k]
+        found, lone = self.camera_to_itrs.copy(), ~self.whole
+        believed, seen = (_turned(axes[lone], self.rays[lone]) for axes in (camera, found))
+        # the smallest turn that takes one to the other
+        spin, cosine = cross_matrices(np.cross(believed, seen)), np.einsum("ki,ki->k", believed, seen)
+        turn = np.eye(3) + spin + spin @ spin / np.maximum(1 + cosine, 1e-12)[:, None, None]
+        found[lone] = turn @ camera[lone]
         return found
 
 

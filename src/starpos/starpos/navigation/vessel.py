@@ -71,12 +71,10 @@ class Vessel:
 
     def law(self, measured: bool) -> MotionLaw | None:
         """How speed and drift change; measured: whether velocities are. None where the velocity over ground is known."""
-        if not measured:
-            return (
-                ANYTHING if self.vehicle is None else None if self.vehicle == PARKED else LAWS[self.vehicle]
-            )
-        if self.drift_stddev <= 0:
+        if measured and self.drift_stddev > 0:
+            # of the water or air against which they are measured
+            walk = DRIFT_CHANGE * self.drift_stddev / DRIFT_CHANGE_S**0.5
+            return replace(LAWS[PARKED], drift_stddev=self.drift_stddev, drift_walk=walk)
+        if measured or self.vehicle == PARKED:
             return None
-        # of the water or air against which they are measured
-        walk = DRIFT_CHANGE * self.drift_stddev / DRIFT_CHANGE_S**0.5
-        return replace(LAWS[PARKED], drift_stddev=self.drift_stddev, drift_walk=walk)
+        return ANYTHING if self.vehicle is None else LAWS[self.vehicle]
