@@ -475,7 +475,7 @@ class Odometry:
         forward = np.einsum("kji,kj->ki", attitude, motion.velocity[k] + velocity - motion.drift[k])
         return self.velocity - (1 + motion.log_scale) * (forward + np.cross(motion.log_axes, forward))
 
-    def summed(self, weight: np.ndarray, values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def totals(self, weight: np.ndarray, values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Sums over the velocities near each of the nodes: of weights (N,), and of values (N, 3) times these."""
         columns = [weight, *(weight * part for part in values.T)]
         total, *parts = (np.bincount(self.node, column, count) for column in columns)
@@ -491,7 +491,7 @@ class Odometry:
         self, motion: Motion, missed: np.ndarray, keep: np.ndarray, vibration: float, n: int
     ) -> Residuals:
         """Equations of the nodes near velocities to keep (N,); missed (N, 3): measured less predicted, m/s."""
-        total, off = self.summed(keep / self.sigma**2, missed, len(motion))
+        total, off = self.totals(keep / self.sigma**2, missed, len(motion))
         index = np.flatnonzero(total)
         sigma = np.hypot(1 / np.sqrt(total[index]), vibration)
         attitude = motion.attitude[index]

@@ -218,7 +218,7 @@ def first_motion(
     latitude, longitude = place_of_zenith(normalised(force))
     velocity = np.zeros((count, 3))
     if odometry is not None:
-        number, total = odometry.summed(np.ones(len(odometry.node)), odometry.velocity, count)
+        number, total = odometry.totals(np.ones(len(odometry.node)), odometry.velocity, count)
         velocity = np.einsum("kij,kj->ki", attitude, total / np.maximum(number, 1)[:, None])
     way = np.cumsum(velocity[:-1] * pieces.span_s[:, None], axis=0)
     return Motion(
