@@ -183,7 +183,8 @@ class FrameSky:
         Of a trail that leaves the frame one end counts. One that is cut at both, or whose light is uneven, is left
         out, and a sentence, else '', says so. FrameError with too few stars around a trail.
         """
-        stars, trails = self.stars, []
+        stars = self.stars
+        trails: list[SatelliteTrail] = []
         for seen in found:
             if seen.cut.all() or not seen.steady:
                 continue
