@@ -228,14 +228,12 @@ class GnssWatch:
         """Bring what was learned to the time of a frame; returns it."""
         tilt = sighting.tilt
         place = place_of_stars(sighting, at_temperature(learned, tilt), self.vertical)
-        here, moved_m = learned.place, 0.0
-        if here is None:
-            here = place.latitude, place.longitude
-        elif self._new_pose:
+        at = place.latitude, place.longitude
+        here, moved_m = learned.place or at, 0.0
+        if self._new_pose:
             way_m = float(np.linalg.norm(place.offset_m(*here)))
             if way_m > ELSEWHERE_SIGMA * math.sqrt(np.linalg.eigvalsh(place.covariance)[-1]):
-                moved_m, here = way_m, (place.latitude, place.longitude)
-        at = place.latitude, place.longitude
+                moved_m, here = way_m, at
         learned, passed = aged(
             learned, self._instrument, self.vertical, sighting, at, moved_m, self._new_pose
         )
