@@ -65,7 +65,8 @@ def check_gravity(pieces: Pieces, sums: Sums, model: ImuModel, camera_to_body: n
 
 def check_turns(stars: StarAttitudes, pieces: Pieces, model: ImuModel, camera_to_body: np.ndarray) -> None:
     """Raise VoyageError where the turns between neighbouring frames differ, by the stars and by the gyro."""
-    near = np.flatnonzero((np.diff(stars.index) == 1) & (pieces.missing_s[stars.index[:-1]] == 0))
+    near = np.flatnonzero(np.diff(stars.index) == 1)
+    near = near[pieces.missing_s[stars.index[near]] == 0]
     first = stars.index[near]
     if len(first) < 3:
         return
