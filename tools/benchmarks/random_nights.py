@@ -147,8 +147,8 @@ def _each(
     first, *others = seeds
     work = partial(_one, night)
     yield work(first)
-    with workers(min(jobs or processors(), len(others))) as processes:
-        for outcome in processes.map((work, seed) for seed in others):
+    with workers(min(jobs or processors(), len(others))) as do_calls:
+        for outcome in do_calls((work, seed) for seed in others):
             if isinstance(outcome, FrameError):
                 raise outcome
             yield outcome

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frozen dataclasses that hold arrays: made in a third of the time, compared by what the arrays hold."""
+"""Frozen dataclasses that hold arrays: made in a third of the time, compared by what these hold, selected by rows."""
 
-from dataclasses import MISSING, Field, fields
+from collections.abc import Sequence
+from dataclasses import MISSING, Field, dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -55,3 +56,25 @@ def _argument(f: "Field[Any]") -> str:
     if f.default_factory is not MISSING or not f.init:
         raise TypeError(f"{f.name} has a factory, or is no argument")
     return f.name if f.default is MISSING else f"{f.name}=_default[{f.name!r}]"
+
+
+Each = TypeVar("Each", bound="ArrayRows")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ArrayRows:
+    """A dataclass of arrays that have a row for each of N things."""
+
+    def select(self: Each, index: np.ndarray | slice) -> Each:
+        """The rows that index selects; a mask (N,) that selects all copies nothing."""
+        if isinstance(index, np.ndarray) and index.dtype == bool and index.all():
+            return self
+        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+
+def joined(parts: Sequence[Each]) -> Each:
+    """The rows of several objects of one class, one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    rows = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(parts[0])}
+    return replace(parts[0], **rows)

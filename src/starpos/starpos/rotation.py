@@ -112,6 +112,13 @@ def cross_matrix(v: ArrayLike) -> np.ndarray:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+def cross_matrices(v: np.ndarray) -> np.ndarray:
+    """The matrices (N, 3, 3) of `cross_matrix` of vectors (N, 3)."""
+    x, y, z = v.T
+    o = np.zeros_like(x)
+    return np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], -2)
+
+
 def best_rotation(source: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """Rotations R (..., 3, 3) that bring R source closest to target, both (..., N, 3) unit vectors.
 

@@ -13,7 +13,7 @@ from starpos.averaging.average import SCATTER, Average
 from starpos.earth.ellipsoid import (
     EQUATOR_RADIUS_M,
     curvature_radii_m,
-    enu_axes,
+    enu_at_zenith,
     ground_m,
     place_of_zenith,
     zenith_of,
@@ -162,7 +162,7 @@ class Directions:
             measured = np.array([c.zenith_distance for c in every])
         nearer = np.array([c.parallax for c in every])[:, None] * ground_m(zenith) / EQUATOR_RADIUS_M
         v = rotation.normalised(np.array([c.itrs for c in every]) - nearer + station_velocity(zenith))
-        axes = enu_at(zenith)
+        axes = enu_at_zenith(zenith)
         local = v @ axes.T
         sine = np.hypot(local[:, 0], local[:, 1])
         slope = -local[:, :2] / np.maximum(sine, 1e-12)[:, None]
@@ -326,7 +326,7 @@ def _refined(part: Directions, weight: np.ndarray, zenith: np.ndarray) -> _Answe
         if np.linalg.norm(step) < SETTLED:
             return _Answer(zenith, gain, float(left @ weight @ left))
         step *= min(1.0, 0.3 / np.linalg.norm(step))
-        zenith = rotation.normalised(zenith + step @ enu_at(zenith)[:2])
+        zenith = rotation.normalised(zenith + step @ enu_at_zenith(zenith)[:2])
     return None
 
 
@@ -380,8 +380,3 @@ def excess(chi2: float, free: int) -> float:
     # the ellipse that holds a share WITHIN, by the F distribution with 2 and `free`, over the ellipse of a known scatter
     wide = free / 2 * ((1 - WITHIN) ** (-2 / free) - 1) / -np.log(1 - WITHIN)
     return float(beyond * wide)
-
-
-def enu_at(zenith: np.ndarray) -> np.ndarray:
-    """East, north and up (3, 3) in ITRS at a zenith (3,)."""
-    return enu_axes(*place_of_zenith(zenith))

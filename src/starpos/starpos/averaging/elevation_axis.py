@@ -13,11 +13,11 @@ from starpos.averaging.altitudes import (
     MIN_JUDGED,
     OUTLIER_SIGMA,
     Directions,
-    enu_at,
     excess,
     starts,
     usual_sigma,
 )
+from starpos.earth.ellipsoid import enu_at_zenith
 from starpos.earth.place import Place
 from starpos.earth.refraction import MIN_COS_ZENITH
 from starpos.errors import FixError
@@ -229,7 +229,7 @@ def _solved(
     part, up = Directions.of(circles), np.array([c.up for c in circles])
     start = rotation.normalised(a3 @ ray)
     bent = np.array([c.zenith_distance for c in circles]) - _seen(up, start)
-    across, along = np.linalg.svd(start[None])[2][1:], enu_at(zenith)[:2]
+    across, along = np.linalg.svd(start[None])[2][1:], enu_at_zenith(zenith)[:2]
     stated, known = part.without(OF_A3), _known(given, start, across)
     if site is not None:
         of_zenith = part.residual(zenith, _seen(up, start) + bent)[1]

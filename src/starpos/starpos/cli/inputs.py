@@ -6,7 +6,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,7 +28,7 @@ from starpos.night.opening import work_of
 from starpos.night.reading import Instruments, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
 from starpos.night.work import Solving
-from starpos.parallel.processes import Workers, memory_bytes, processors, workers
+from starpos.parallel.processes import DoCalls, memory_bytes, processors, workers
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:
@@ -228,7 +228,7 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
 FRAMES_A_PROCESS, PICTURE_BYTES, PROCESS_BYTES = 8, 1_000_000, 1 << 30
 
 
-def workers_of(args: argparse.Namespace, paths: Sequence[str]) -> Workers:
+def workers_of(args: argparse.Namespace, paths: Sequence[str]) -> AbstractContextManager[DoCalls]:
     """The workers that --jobs asks for, no more than files; by default as many as pay and have memory."""
     most = len(paths)
     if args.jobs is None:
@@ -245,8 +245,8 @@ def worked(
     lines: bool = True,
 ) -> Iterator:
     """What a work makes of each file, in their order, by the workers of --jobs, as `watched`."""
-    with workers_of(args, paths) as workers:
-        yield from watched(workers.map((work, path) for path in paths), len(paths), what, lines)
+    with workers_of(args, paths) as do_calls:
+        yield from watched(do_calls((work, path) for path in paths), len(paths), what, lines)
 
 
 def watched(answers: Iterable, number: int, what: str = "frame", lines: bool = True) -> Iterator:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, inputs, options
-from starpos.earth.gravity import itrs_place
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, SatelliteError, StarposError
@@ -107,11 +107,11 @@ def _look(args: argparse.Namespace, frames: list[str], trails: list[SatelliteTra
         elif isinstance(answer, Solution):
             complaints(path, answer.message)
         else:
-            sights[path], found = answer
-            if found.left_out:
-                complaints(path, found.left_out)
-            trails += [replace(t, track=number + k, file=path) for k, t in enumerate(found.trails)]
-            number += len(found.trails)
+            sights[path], found, left_out = answer
+            if left_out:
+                complaints(path, left_out)
+            trails += [replace(t, track=number + k, file=path) for k, t in enumerate(found)]
+            number += len(found)
     complaints.end()
     return sights
 
@@ -123,25 +123,21 @@ def _prior(args: argparse.Namespace, utc_unix_s: float) -> KnownBefore:
         prior = prior._replace(height_stddev_m=args.height_stddev)
     if args.near is not None:
         latitude, longitude, km = args.near
-        covariance = (km * KM) ** 2 * np.eye(2)
         if not (abs(latitude) <= 90 and abs(longitude) <= 360 and 0 < km < 20_000):
             raise SatelliteError("--near takes a latitude, a longitude (deg) and an error in km")
-    elif args.join is not None:
-        latitude, longitude, covariance = _joined(args.join, utc_unix_s)
-    else:
-        return prior
-    place = itrs_place(math.radians(latitude), math.radians(longitude), prior.height_m)
-    return prior._replace(place=place, covariance=covariance)
+        near = Place.on_ellipsoid(latitude, longitude, covariance=(km * KM) ** 2 * np.eye(2))
+        return prior._replace(near=near)
+    return prior if args.join is None else prior._replace(near=_joined(args.join, utc_unix_s))
 
 
-def _joined(path: str, utc_unix_s: float) -> tuple[float, float, np.ndarray]:
-    """Latitude, longitude (deg) and covariance (2, 2) of a place: of what `starpos solve --json` printed, or of GNSS."""
+def _joined(path: str, utc_unix_s: float) -> Place:
+    """The place of what `starpos solve --json` printed, or of GNSS."""
     if Path(path).suffix.lower() == ".csv":
         track, faults = read_gnss_csv(path)
         console.complain(*faults)
         if (place := track.at(utc_unix_s)) is None:
             raise SatelliteError(f"{path}: no GNSS place at {utc_text(utc_unix_s)}, of the first trail")
-        return math.degrees(place.latitude), math.degrees(place.longitude), place.covariance
+        return place
     try:
         text = read_regular(path, MOST_JSON_BYTES).decode()
         rows = [json.loads(line) for line in text.splitlines() if line.startswith("{")]
@@ -156,7 +152,7 @@ def _joined(path: str, utc_unix_s: float) -> tuple[float, float, np.ndarray]:
         ) from None
     if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
         raise SatelliteError(f"{path}: the covariance of its place is impossible")
-    return latitude, longitude, covariance
+    return Place.on_ellipsoid(latitude, longitude, covariance=covariance)
 
 
 def trail_json(trail: SatelliteTrail, fix: SatelliteFix, k: int) -> dict:

@@ -292,9 +292,9 @@ def _run(args: argparse.Namespace) -> int:
     by_log = args.tilt is not None and is_phone_log(Path(args.tilt)) and are_photographs(args.frames)
     read = inputs.reader_of(args, by_gravity or by_log)
     statuses = [_refused(why, given) for why in given if not isinstance(why, inputs.NightFolder)]
-    with inputs.workers_of(args, [path for night in nights for path in night.frames]) as workers:
+    with inputs.workers_of(args, [path for night in nights for path in night.frames]) as do_calls:
         plans = []
-        abouts = workers.map((partial(read.first, levelled=by_gravity), night.frames) for night in nights)
+        abouts = do_calls((partial(read.first, levelled=by_gravity), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):
             try:
                 plans.append((night, _work(args, night, about, own_level, place, by_gravity)))
@@ -303,7 +303,7 @@ def _run(args: argparse.Namespace) -> int:
         on_files = [partial(read.on, how.work(work)) for _, work in plans]
         calls = [(f, path) for f, (night, _) in zip(on_files, plans, strict=True) for path in night.frames]
         # the lines of a turn come at its end, and show no progress
-        sights = inputs.watched(workers.map(calls), len(calls), lines=how.one_by_one)
+        sights = inputs.watched(do_calls(calls), len(calls), lines=how.one_by_one)
         for night, work in plans:
             # takes the answers of this night, and leaves the rest
             rows = zip(night.frames, sights, strict=False)

@@ -9,7 +9,8 @@ from scipy import ndimage
 
 from starpos.detection._fit import Rules, fit_stamps
 from starpos.detection.psf import Psf
-from starpos.detection.stamps import Stamps, StarRows, joined
+from starpos.detection.stamps import Stamps
+from starpos.frozen import ArrayRows, joined
 
 # Sigmas above the model, and that share of the star's brightest pixel, from which a pixel is not the star's alone.
 OUTLIER, FAINT = 6.0, 0.15
@@ -57,7 +58,7 @@ class Response:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Fit(StarRows):
+class Fit(ArrayRows):
     """N fitted stars.
 
     x, y              (N,) px

@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pixels around each star, all stars at once, and their Gaussian-windowed moments."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from dataclasses import dataclass
 
 import numpy as np
 
 from starpos.detection._moments import centroids, clip_widths
 from starpos.detection._pixels import cut_stamps, measure_rims, sum_squares
 from starpos.detection.background import SkyPlane
+from starpos.frozen import ArrayRows
 from starpos.units import SIGMA_PER_MAD
 
 # Around a star the sky counts as brighter or less even than the mesh says where about 50 pixels lie so far above it, or
@@ -22,30 +21,8 @@ ALONE, NOTHING = 0.25, 3.0
 HALF, QUARTER = 0.5, 0.25
 
 
-Each = TypeVar("Each", bound="StarRows")
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
-class StarRows:
-    """A dataclass of arrays that have a row for each of N stars."""
-
-    def select(self: Each, index: np.ndarray | slice) -> Each:
-        """The rows that index selects; a mask (N,) that selects all copies nothing."""
-        if isinstance(index, np.ndarray) and index.dtype == bool and index.all():
-            return self
-        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
-
-
-def joined(parts: Sequence[Each]) -> Each:
-    """The rows of several objects of one class, one after the other."""
-    if len(parts) == 1:
-        return parts[0]
-    rows = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(parts[0])}
-    return replace(parts[0], **rows)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Stamps(StarRows):
+class Stamps(ArrayRows):
     """Squares of S x S px around N stars, S odd.
 
     x, y    (N,) int: the central pixel of each

@@ -19,10 +19,10 @@ from starpos.detection.stamps import (
     Stamps,
     centroid,
     cut,
-    joined,
     window_for,
 )
 from starpos.frames.frame import BLENDED, EDGE, ELONGATED, SATURATED
+from starpos.frozen import joined
 from starpos.units import SIGMA_PER_MAD
 
 # Maximum size in pixels of an outlier that is a hot pixel or a cosmic ray on the star, not another source.

@@ -38,6 +38,11 @@ def enu_axes(latitude: float, longitude: float) -> np.ndarray:
     return np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
 
 
+def enu_at_zenith(zenith: np.ndarray) -> np.ndarray:
+    """East, north, up (3, 3), as rows, where a vector (3,) points up: of a star, also along growing coordinates."""
+    return enu_axes(*place_of_zenith(zenith))
+
+
 def meridian_turn(latitude: float) -> float:
     """Turn (rad) of north on the way of 1 rad to the east, tan(latitude), up to STEEPEST; finite at a pole."""
     return min(max(math.tan(latitude), -STEEPEST), STEEPEST)

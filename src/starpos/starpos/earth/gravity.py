@@ -8,7 +8,7 @@ ellipsoid's normal is the plumb line.
 import erfa
 import numpy as np
 
-from starpos.earth.ellipsoid import ECCENTRICITY2, EQUATOR_RADIUS_M
+from starpos.earth.ellipsoid import ECCENTRICITY2, EQUATOR_RADIUS_M, enu_axes
 from starpos.earth.orientation import ROTATION_RAD_S, TT_MINUS_UTC_S, earth_state
 from starpos.earth.vertical import SOMIGLIANA_K
 from starpos.rotation import unit_vector
@@ -36,6 +36,12 @@ def zenith_at(place: np.ndarray) -> np.ndarray:
     """Unit vectors (..., 3) that point up at places (..., 3) in ITRS, m."""
     latitude, longitude, _ = geodetic_place(place)
     return unit_vector(longitude, latitude)
+
+
+def enu_at(place: np.ndarray) -> np.ndarray:
+    """East, north, up (3, 3), as rows, by the ellipsoid at a place (3,) in ITRS, m."""
+    latitude, longitude, _ = geodetic_place(place)
+    return enu_axes(float(latitude), float(longitude))
 
 
 def gravity(place: np.ndarray) -> np.ndarray:

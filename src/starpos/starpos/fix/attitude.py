@@ -12,7 +12,7 @@ from starpos.fix.terms import ErrorTerm
 from starpos.frozen import at_once
 
 # Names of frames, as docs/frames_and_symbols.md has them.
-CAMERA, LINK, ITRS, GCRS, ENU = "camera", "link", "ITRS", "GCRS", "ENU"
+CAMERA, LINK, ITRS, ENU = "camera", "link", "ITRS", "ENU"
 # Variance (rad2) of the turn about the only direction that is seen, and from which it is said to be unknown.
 ANY_TURN, UNKNOWN_TURN = 10.0, 1.0
 
@@ -33,6 +33,11 @@ class Attitude:
     of: str
     into: str
     terms: tuple[ErrorTerm, ...] = ()
+
+    @classmethod
+    def by_own(cls, turn: np.ndarray, own: np.ndarray, *, of: str, into: str) -> "Attitude":
+        """A rotation whose error is stated by `own` (3, 3), the covariance about the axes of `of`."""
+        return cls(turn, turn @ own @ turn.T, of=of, into=into)
 
     def then(self, turn: np.ndarray, into: str) -> "Attitude":
         """The attitude in another frame, without its budget; turn (3, 3): from the axes of `into` to the new ones."""

@@ -67,14 +67,14 @@ def innovation(
     rows[:, at.field] += np.eye(2)
     rows[:, at.gnss] -= np.eye(2)
     radii = np.array(curvature_radii_m(gnss.latitude))
-    noise = axes[:2] @ (sighting.zenith_by_stars + tilt_noise(sighting, learned)) @ axes[:2].T
+    noise = axes[:2] @ zenith_noise(sighting, learned) @ axes[:2].T
     return Innovation(seen, rows, noise + gnss.covariance / np.outer(radii, radii))
 
 
-def tilt_noise(sighting: Fix, learned: Learned) -> np.ndarray:
-    """Covariance (3, 3) of the zenith in ITRS by the noise of the readings."""
+def zenith_noise(sighting: Fix, learned: Learned) -> np.ndarray:
+    """Covariance (3, 3) of the zenith in ITRS by the stars and the noise of the readings."""
     back = sighting.camera.rotation @ learned.rotation.T @ sighting.tilt.slope
-    return back @ sighting.tilt.noise @ back.T
+    return sighting.zenith_by_stars + back @ sighting.tilt.noise @ back.T
 
 
 def place_of_stars(sighting: Fix, learned: Learned, vertical: Vertical) -> Place:
@@ -87,7 +87,7 @@ def place_of_stars(sighting: Fix, learned: Learned, vertical: Vertical) -> Place
     at = learned.layout
     rows[:, at.constant] -= np.eye(2)
     rows[:, at.field] -= np.eye(2)
-    noise = axes[:2] @ (sighting.zenith_by_stars + tilt_noise(sighting, learned)) @ axes[:2].T
+    noise = axes[:2] @ zenith_noise(sighting, learned) @ axes[:2].T
     covariance = rows @ learned.covariance @ rows.T + noise
     radii = np.array(curvature_radii_m(latitude))
     latitude, longitude = place_of_zenith(rotation.normalised(axes[2] - east_north @ axes[:2]))
@@ -164,12 +164,10 @@ def begun(instrument: Instrument, frames: Sequence[GnssFrame], vertical: Vertica
         )  # fmt: skip
         for frame in frames:
             learned = taught(learned, frame, instrument, vertical)
-        turned = learned.rotation
-        off = float(np.linalg.norm(learned.state[at.a3]))
+        a3 = learned.rotation
         if instrument.calibration.unknown:
-            stated = turned
-        a3 = turned
-        if off < SETTLED_RAD:
+            stated = a3
+        if np.linalg.norm(learned.state[at.a3]) < SETTLED_RAD:
             break
     return learned
 

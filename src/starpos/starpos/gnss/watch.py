@@ -21,6 +21,7 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.fix.fix import Fix
+from starpos.frozen import ArrayRows, joined
 from starpos.gnss.filter import (
     GnssFrame,
     Innovation,
@@ -49,49 +50,31 @@ MIN_INFORMATION = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class OnsetFilters:
+class OnsetFilters(ArrayRows):
     """W filters, each with n states and then the error of GNSS: east, north of a step, and of a growth in UNIT_S.
 
-    before: the state that each was copied from.  since (W,): time of the copy.  frames (W,): number used since.
+    before (W,): the Learned that each was copied from.  since (W,): time of the copy.  frames (W,): number used since.
     """
 
-    before: tuple[Learned, ...]
+    before: np.ndarray
     since: np.ndarray
     frames: np.ndarray
     state: np.ndarray
     covariance: np.ndarray
 
     @classmethod
-    def empty(cls, size: int) -> "OnsetFilters":
-        """No filters yet, for a number of states."""
-        n = size + OFFSETS
-        return cls((), np.zeros(0), np.zeros(0, int), np.zeros((0, n)), np.zeros((0, n, n)))
-
-    def started(self, learned: Learned) -> "OnsetFilters":
-        """These filters and a copy of the present one."""
+    def copied(cls, learned: Learned) -> "OnsetFilters":
+        """One filter, a copy of the present one."""
         n = len(learned.state)
         state, covariance = np.zeros((1, n + OFFSETS)), np.zeros((1, n + OFFSETS, n + OFFSETS))
         state[0, :n], covariance[0, :n, :n] = learned.state, learned.covariance
         covariance[0, n:, n:] = np.eye(OFFSETS) * NOTHING_RAD**2
-        return OnsetFilters(
-            (*self.before, learned),
-            np.append(self.since, learned.utc_unix_s),
-            np.append(self.frames, 0),
-            np.concatenate([self.state, state]),
-            np.concatenate([self.covariance, covariance]),
-        )
+        before, since = np.array([learned], object), np.array([learned.utc_unix_s])
+        return cls(before, since, np.zeros(1, int), state, covariance)
 
     def due(self, utc_unix_s: float) -> bool:
         """Whether another copy should be made."""
         return not len(self.since) or utc_unix_s - self.since[-1] >= COPY_INTERVAL_S
-
-    def recent(self, utc_unix_s: float) -> "OnsetFilters":
-        """The filters that are not older than LONGEST_S."""
-        which = utc_unix_s - self.since <= LONGEST_S
-        before = tuple(b for b, kept in zip(self.before, which, strict=True) if kept)
-        return OnsetFilters(
-            before, self.since[which], self.frames[which], self.state[which], self.covariance[which]
-        )
 
     def aged(self, by: Ageing) -> "OnsetFilters":
         """These filters with the process noise of the time that passed."""
@@ -220,7 +203,7 @@ class GnssWatch:
         self._held: deque[GnssFrame] = deque(maxlen=MAX_HELD)
         # the readings of a frame that would have been an alarm, before A3 was known
         self._suspicious: frozenset[float] | None = None
-        self._onsets = OnsetFilters.empty(0)
+        self._onsets: OnsetFilters | None = None
 
     def advance(self, sighting: Fix) -> None:
         """Advance to the time of a frame, seen with any A3: only the attitude of its camera counts."""
@@ -239,29 +222,29 @@ class GnssWatch:
             stddev = stddev_rad(self.vertical, sighting.latitude, sighting.longitude)
             self.learned = prior(self._instrument, tilt, stddev, sighting.utc_unix_s)
             self.is_learning = not is_linear(self.learned, tilt)
-        self._age(sighting)
+        self._age(self.learned, sighting)
 
-    def _age(self, sighting: Fix) -> None:
-        learned, tilt = self.learned, sighting.tilt
-        assert learned is not None
+    def _age(self, learned: Learned, sighting: Fix) -> Learned:
+        """Bring what was learned to the time of a frame; returns it."""
+        tilt = sighting.tilt
         place = place_of_stars(sighting, at_temperature(learned, tilt), self.vertical)
-        here, moved_m = learned.place, 0.0
-        if here is None:
-            here = place.latitude, place.longitude
-        elif self._new_pose:
+        at = place.latitude, place.longitude
+        here, moved_m = learned.place or at, 0.0
+        if self._new_pose:
             way_m = float(np.linalg.norm(place.offset_m(*here)))
             if way_m > ELSEWHERE_SIGMA * math.sqrt(np.linalg.eigvalsh(place.covariance)[-1]):
-                moved_m, here = way_m, (place.latitude, place.longitude)
-        at = place.latitude, place.longitude
+                moved_m, here = way_m, at
         learned, passed = aged(
             learned, self._instrument, self.vertical, sighting, at, moved_m, self._new_pose
         )
-        self.learned = replace(learned, place=here)
-        if len(self._onsets.since):
+        self.learned = learned = replace(learned, place=here)
+        if self._onsets is not None:
             self._onsets = self._onsets.aged(passed)
             # the one that may bring GNSS back has to last for all of its frames, however far they are apart
             if not self.disagrees:
-                self._onsets = self._onsets.recent(sighting.utc_unix_s)
+                recent = sighting.utc_unix_s - self._onsets.since <= LONGEST_S
+                self._onsets = self._onsets.select(recent)
+        return learned
 
     def up_in_camera(self, tilt: Tilt) -> np.ndarray | None:
         """Up (3,) in C at a tilt by what was learned; None if nothing is known."""
@@ -296,18 +279,23 @@ class GnssWatch:
         single = chi2(self.learned, seen)
         if self.is_learning:
             return self._check(self._while_starting(single, sighting.tilt), sighting, gnss)
-        onsets = self._onsets if len(self._onsets.since) else OnsetFilters.empty(len(self.learned.state))
-        # While GNSS is not believed there is one filter. If GNSS was away for long, it was dropped for its age.
-        if not len(onsets.since) or (not self.disagrees and onsets.due(sighting.utc_unix_s)):
-            onsets = onsets.started(self.learned)
-        self._onsets = onsets.updated(seen, self.learned.state, sighting.utc_unix_s)
-        against = self._onsets.evidence(sighting.utc_unix_s)
+        if (onsets := self._onsets) is None:
+            onsets = OnsetFilters.copied(self.learned)
+        # while GNSS is not believed there is one filter
+        elif not self.disagrees and onsets.due(sighting.utc_unix_s):
+            onsets = joined([onsets, OnsetFilters.copied(self.learned)])
+        self._onsets = onsets = onsets.updated(seen, self.learned.state, sighting.utc_unix_s)
+        against = onsets.evidence(sighting.utc_unix_s)
         worst = max(single, float(against.max()))
-        if self.disagrees:
-            self._may_return(worst, sighting.utc_unix_s)
+        if self.disagrees and worst > BACK:
+            # each contradiction begins the time anew in which GNSS has to agree
+            self._onsets = OnsetFilters.copied(self.learned)
+        elif self.disagrees:
+            agreed_s = sighting.utc_unix_s - onsets.since[0]
+            self.disagrees = bool(agreed_s < BACK_S or onsets.frames[0] < BACK_FRAMES)
         elif worst > ALARM:
             # where the frame alone raised the alarm, this is still the likeliest moment at which the error began
-            self._take_back(int(np.argmax(against)), sighting)
+            self._take_back(onsets.before[max(int(np.argmax(against)) - 1, 0)], sighting)
         if self.disagrees:
             return self._check(GnssStatus.DISAGREES, sighting, gnss)
         return self._check(GnssStatus.DOUBTFUL if worst > DOUBT else GnssStatus.AGREES, sighting, gnss)
@@ -323,23 +311,11 @@ class GnssWatch:
             self._suspicious = readings
         return GnssStatus.DISAGREES if again else GnssStatus.DOUBTFUL
 
-    def _take_back(self, onset: int, sighting: Fix) -> None:
+    def _take_back(self, learned: Learned, sighting: Fix) -> None:
         """Return to the state one copy before the likeliest onset of the error."""
-        self.disagrees = True
-        self.learned = self._onsets.before[max(onset - 1, 0)]
-        self._onsets = OnsetFilters.empty(0)
-        self._new_pose = True
-        self._age(sighting)
-        assert self.learned is not None
-        self._onsets = OnsetFilters.empty(len(self.learned.state)).started(self.learned)
-
-    def _may_return(self, worst: float, utc_unix_s: float) -> None:
-        """Believe GNSS again once it has agreed for BACK_S; each contradiction begins that time anew."""
-        assert self.learned is not None
-        if worst > BACK:
-            self._onsets = OnsetFilters.empty(len(self.learned.state)).started(self.learned)
-        elif utc_unix_s - self._onsets.since[0] >= BACK_S and self._onsets.frames[0] >= BACK_FRAMES:
-            self.disagrees = False
+        self.disagrees, self.learned = True, learned
+        self._onsets, self._new_pose = None, True
+        self._onsets = OnsetFilters.copied(self._age(learned, sighting))
 
     def _check(self, status: GnssStatus, sighting: Fix, gnss: Place) -> GnssCheck:
         assert self.learned is not None

@@ -41,11 +41,6 @@ class Smoothed:
     covariance: np.ndarray
 
 
-def smoothed(chain: Chain) -> Smoothed:
-    """Solve a chain."""
-    return _backward(*_forward(chain), chain.unknowns)
-
-
 def log_likelihood(chain: Chain) -> float:
     """Logarithm of how likely the equations are, whatever the unknowns, but for the determinants of their whitening."""
     eliminated, last = _forward(chain)
@@ -77,9 +72,10 @@ def _triangle(rows: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-def _backward(eliminated: np.ndarray, last: np.ndarray, n: int) -> Smoothed:
-    """All unknowns from what `_forward` returns."""
-    count, size = len(eliminated) + 1, last.shape[1] - 1
+def smoothed(chain: Chain) -> Smoothed:
+    """Solve a chain: the last node and the constants first, then each node from the one after it."""
+    (eliminated, last), n = _forward(chain), chain.unknowns
+    count, size = len(chain.nodes), last.shape[1] - 1
     root = solve_triangular(last[:-1, :-1], np.eye(size), check_finite=False)
     x = root @ last[:-1, -1]
     nodes, constants = np.empty((count, n)), x[n:]

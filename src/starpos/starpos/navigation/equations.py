@@ -6,17 +6,18 @@ until the next one ITRS turns with the Earth. There is no latitude or longitude 
 other places.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starpos.earth.gravity import SPIN, geodetic_place, gravity, gravity_gradient, zenith_at
 from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.frozen import ArrayRows
 from starpos.navigation.preintegration import ERRORS, Pieces, Sums, summed
 from starpos.navigation.records import ImuModel, VelocityLog
 from starpos.navigation.vessel import MotionLaw, Vessel
-from starpos.rotation import normalised
+from starpos.rotation import cross_matrices, normalised
 from starpos.units import SIGMA_PER_MAD
 
 # Columns of a node: place m and velocity m/s in ITRS, attitude as a small rotation about ITRS's axes in rad, biases of
@@ -170,9 +171,9 @@ def links_of(motion: Motion, sums: Sums, pieces: Pieces, model: ImuModel, law: M
     # in the axes that stay
     onward[:, PLACE, PLACE] = unit + SPINNING * dt + pull * dt**2 / 2
     onward[:, PLACE, VELOCITY] = unit * dt
-    onward[:, PLACE, TURN] = -crosses(way)
+    onward[:, PLACE, TURN] = -cross_matrices(way)
     onward[:, VELOCITY, PLACE] = SPINNING + pull * dt
-    onward[:, VELOCITY, TURN] = -crosses(speed)
+    onward[:, VELOCITY, TURN] = -cross_matrices(speed)
     constants = np.zeros((count, n, CONSTANTS))
     columns = (GYRO_BIAS, GYRO_MATRIX), (ACCEL_BIAS, ACCEL_MATRIX)
     for state, slope in ((PLACE, sums.way_slope), (VELOCITY, sums.speed_slope), (TURN, sums.turn_slope)):
@@ -217,7 +218,7 @@ def _noise(force: np.ndarray, pieces: Pieces, model: ImuModel, law: MotionLaw | 
     """Covariance (K - 1, n, n) of what the readings' noise adds up to, under mean forces (K - 1, 3) in ITRS."""
     dt, unit = pieces.span_s[:, None, None], np.eye(3)
     gyro = model.gyroscope_noise_density**2
-    tilting = -crosses(force)
+    tilting = -cross_matrices(force)
     tilted = tilting @ tilting.transpose(0, 2, 1)
     noise = np.zeros((len(dt), n, n))
     noise[:, TURN, TURN] = gyro * dt * unit
@@ -250,13 +251,6 @@ def _add_force_noise(noise: np.ndarray, density2: float | np.ndarray, dt: np.nda
     noise[:, PLACE, PLACE] += dt**3 / 3 * unit
 
 
-def crosses(v: np.ndarray) -> np.ndarray:
-    """Matrices (K, 3, 3) of the cross products with vectors (K, 3)."""
-    x, y, z = v.T
-    o = np.zeros_like(x)
-    return np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], -2)
-
-
 def _turned(axes: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.einsum("kij,kj->ki", axes, v)
 
@@ -270,7 +264,7 @@ SCALE_STDDEV, AXES_STDDEV, LAG_STDDEV_S = 0.01, 0.005, 0.005
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class StarAttitudes:
+class StarAttitudes(ArrayRows):
     """Attitudes of the camera at F of the nodes: index (F,), camera_to_itrs (F, 3, 3), C into ITRS.
 
     covariance (F, 3, 3), by_refraction (F, 3); stamp_stddev_s (F,).
@@ -289,43 +283,29 @@ class StarAttitudes:
         """Mask (F,) of the attitudes that are known about every axis."""
         return np.asarray(~self.rays.any(1))
 
-    def part(self, keep: np.ndarray) -> "StarAttitudes":
-        """Some of them, by a mask (F,)."""
-        return StarAttitudes(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
-
     def nearest(self, camera: np.ndarray) -> np.ndarray:
         """The attitudes (F, 3, 3), each turned about its ray so that it is nearest to the camera's (F, 3, 3)."""
         found, lone = self.camera_to_itrs.copy(), ~self.whole
-        # scipy 1.11, as Ubuntu has it, makes no empty array of rotations
-        if not lone.any():
-            return found
-        camera, ray = camera[lone], self.rays[lone]
-        believed, seen = _turned(camera, ray), _turned(found[lone], ray)
-        axis = np.cross(believed, seen)
-        sine = np.linalg.norm(axis, axis=1)
-        angle = np.arctan2(sine, np.einsum("ki,ki->k", believed, seen))
-        turn = Rotation.from_rotvec(axis * (angle / np.maximum(sine, 1e-12))[:, None]).as_matrix()
-        found[lone] = turn @ camera
+        believed, seen = (_turned(axes[lone], self.rays[lone]) for axes in (camera, found))
+        # the smallest turn that takes one to the other
+        spin, cosine = cross_matrices(np.cross(believed, seen)), np.einsum("ki,ki->k", believed, seen)
+        turn = np.eye(3) + spin + spin @ spin / np.maximum(1 + cosine, 1e-12)[:, None, None]
+        found[lone] = turn @ camera[lone]
         return found
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Residuals:
+class Residuals(ArrayRows):
     """Equations (F, 3, n + m + 1) of some nodes, index (F,), not whitened, and covariances (F, 3, 3) of their errors."""
 
     index: np.ndarray
     rows: np.ndarray
     covariance: np.ndarray
 
-    def part(self, keep: np.ndarray) -> "Residuals":
-        """Some of the equations, by a mask (F,)."""
-        return Residuals(index=self.index[keep], rows=self.rows[keep], covariance=self.covariance[keep])
-
     def whitened(self, count: int) -> np.ndarray:
         """Equations (count, 3, n + m + 1) of all nodes, with zeros at nodes without one."""
         all_rows = np.zeros((count, *self.rows.shape[1:]))
-        if len(self.index):
-            all_rows[self.index] = np.linalg.solve(np.linalg.cholesky(self.covariance), self.rows)
+        all_rows[self.index] = np.linalg.solve(np.linalg.cholesky(self.covariance), self.rows)
         return all_rows
 
     def distance2(self, covariance: np.ndarray, left_out: np.ndarray) -> np.ndarray:
@@ -375,19 +355,17 @@ def _rates(sums: Sums, pieces: Pieces) -> np.ndarray:
 
 def standing_residuals(motion: Motion, index: np.ndarray, sigma: float, n: int) -> Residuals:
     """Equations of nodes (F,) at which the vehicle stands, within sigma m/s."""
-    rows = np.zeros((len(index), 3, n + CONSTANTS + 1))
-    rows[:, :, VELOCITY] = np.eye(3)
-    rows[:, :, -1] = -motion.velocity[index]
-    return Residuals(index=index, rows=rows, covariance=np.tile(sigma**2 * np.eye(3), (len(index), 1, 1)))
+    covariance = np.tile(sigma**2 * np.eye(3), (len(index), 1, 1))
+    return known_residuals(VELOCITY, -motion.velocity[index], index, covariance, n)
 
 
-def place_residuals(
-    motion: Motion, index: np.ndarray, place: np.ndarray, covariance: np.ndarray, n: int
+def known_residuals(
+    columns: slice, off: np.ndarray, index: np.ndarray, covariance: np.ndarray, n: int
 ) -> Residuals:
-    """Equations of nodes (F,) whose place (F, 3) is known, m in ITRS, with its covariance (F, 3, 3)."""
+    """Equations of nodes (F,) at which a vector, PLACE or VELOCITY, is known, and is off (F, 3) more than believed."""
     rows = np.zeros((len(index), 3, n + CONSTANTS + 1))
-    rows[:, :, PLACE] = np.eye(3)
-    rows[:, :, -1] = place - motion.place[index]
+    rows[:, :, columns] = np.eye(3)
+    rows[:, :, -1] = off
     return Residuals(index=index, rows=rows, covariance=covariance)
 
 
@@ -497,6 +475,12 @@ class Odometry:
         forward = np.einsum("kji,kj->ki", attitude, motion.velocity[k] + velocity - motion.drift[k])
         return self.velocity - (1 + motion.log_scale) * (forward + np.cross(motion.log_axes, forward))
 
+    def totals(self, weight: np.ndarray, values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Sums over the velocities near each of the nodes: of weights (N,), and of values (N, 3) times these."""
+        columns = [weight, *(weight * part for part in values.T)]
+        total, *parts = (np.bincount(self.node, column, count) for column in columns)
+        return total, np.stack(parts, -1)
+
     def sound(self, missed: np.ndarray) -> np.ndarray:
         """Mask (N,) of the velocities within what most of them scatter on each axis, or should; missed (N, 3) m/s."""
         off = np.abs(missed) / self.sigma[:, None]
@@ -507,21 +491,19 @@ class Odometry:
         self, motion: Motion, missed: np.ndarray, keep: np.ndarray, vibration: float, n: int
     ) -> Residuals:
         """Equations of the nodes near velocities to keep (N,); missed (N, 3): measured less predicted, m/s."""
-        weight = keep / self.sigma**2
-        total = np.bincount(self.node, weight, len(motion))
+        total, off = self.totals(keep / self.sigma**2, missed, len(motion))
         index = np.flatnonzero(total)
-        mean = np.stack([np.bincount(self.node, weight * part, len(motion)) for part in missed.T], -1)[index]
         sigma = np.hypot(1 / np.sqrt(total[index]), vibration)
         attitude = motion.attitude[index]
         through = motion.velocity[index] - motion.drift[index]
         forward = np.einsum("kji,kj->ki", attitude, through)
         rows = np.zeros((len(index), 3, n + CONSTANTS + 1))
         rows[:, :, VELOCITY] = attitude.transpose(0, 2, 1)
-        rows[:, :, TURN] = attitude.transpose(0, 2, 1) @ crosses(through)
+        rows[:, :, TURN] = attitude.transpose(0, 2, 1) @ cross_matrices(through)
         if n == BY_LAW:
             rows[:, :, DRIFT] = -attitude.transpose(0, 2, 1)
         constants = rows[:, :, n:-1]
         constants[:, :, LOG_SCALE] = forward[..., None]
-        constants[:, :, LOG_AXES] = -crosses(forward)
-        rows[:, :, -1] = mean / total[index, None]
+        constants[:, :, LOG_AXES] = -cross_matrices(forward)
+        rows[:, :, -1] = off[index] / total[index, None]
         return Residuals(index=index, rows=rows, covariance=(sigma**2)[:, None, None] * np.eye(3))

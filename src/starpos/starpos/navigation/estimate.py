@@ -7,7 +7,7 @@ import numpy as np
 
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn
-from starpos.earth.gravity import geodetic_place
+from starpos.earth.gravity import enu_at, geodetic_place
 from starpos.earth.orientation import earth_state
 from starpos.fix.attitude import ENU, LINK, Attitude, heading_of, heading_row
 from starpos.fix.budget import time_terms
@@ -61,52 +61,12 @@ class VoyageFix(PlaceFix):
     accel_bias: np.ndarray
 
 
-def fix_of(
-    motion: Motion, k: int, covariance: np.ndarray, clock_stddev_s: float, stamp_stddev_s: float
-) -> VoyageFix:
-    """The fix at node k, of whose unknowns this is the covariance; the errors of time and Earth rotation are added.
-
-    clock_stddev_s, stamp_stddev_s: errors of time that all fixes share, of the clock and of the frames' stamps.
-    """
-    latitude, longitude, _ = (float(x) for x in geodetic_place(motion.place[k]))
-    enu, (prime, meridian) = enu_axes(latitude, longitude), curvature_radii_m(latitude)
-    attitude = enu @ motion.attitude[k]
-    # turns of east, north, up about themselves for a metre to the east and to the north
-    carried = np.array([[0, -1 / meridian], [1 / prime, 0], [meridian_turn(latitude) / prime, 0]])
-    # rows of an ErrorTerm, by place and attitude in ITRS
-    slope = np.zeros((6, 6))
-    slope[:2, :3] = enu[:2]
-    slope[3:, :3] = -carried @ enu[:2]
-    slope[3:, 3:] = enu
-    slope[2] = heading_row(attitude) @ slope[3:]
-    columns = np.r_[PLACE, TURN]
-    own = ErrorTerm("adjustment", slope @ symmetric_root(covariance[np.ix_(columns, columns)]))
-    earth = earth_state(float(motion.utc_unix_s[k]))
-    terms = own, *time_terms(latitude, earth, clock_stddev_s, stamp_stddev_s)
-    return VoyageFix(
-        utc_unix_s=float(motion.utc_unix_s[k]),
-        latitude=latitude,
-        longitude=longitude,
-        heading=heading_of(attitude),
-        terms=terms,
-        velocity=enu @ motion.velocity[k],
-        velocity_covariance=enu @ covariance[VELOCITY, VELOCITY] @ enu.T,
-        link=Attitude(attitude, total_covariance(terms)[3:, 3:], of=LINK, into=ENU),
-        gyro_bias=motion.gyro_bias[k],
-        accel_bias=motion.accel_bias[k],
-    )
-
-
-# the equations of a link hold for so long
-LONGEST_S = 1.5
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Estimate:
     """A motion of one node, and the covariance (n + m, n + m) of its unknowns with the constants.
 
     model: of the IMU, its noise as the voyage shows it.  law: whose unknowns the node has, if any.
-    clock_stddev_s, stamp_stddev_s: as in `fix_of`.
+    clock_stddev_s, stamp_stddev_s: errors of time that all fixes share, of the clock and of the frames' stamps.
     """
 
     motion: Motion
@@ -127,12 +87,40 @@ class Estimate:
 
     @property
     def fix(self) -> VoyageFix:
-        return fix_of(self.motion, 0, self.covariance, self.clock_stddev_s, self.stamp_stddev_s)
+        """The fix; the errors of time and of the Earth's rotation are added."""
+        motion, covariance = self.motion, self.covariance
+        latitude, longitude, _ = (float(x) for x in geodetic_place(motion.place[0]))
+        enu, (prime, meridian) = enu_axes(latitude, longitude), curvature_radii_m(latitude)
+        attitude = enu @ motion.attitude[0]
+        # turns of east, north, up about themselves for a metre to the east and to the north
+        carried = np.array([[0, -1 / meridian], [1 / prime, 0], [meridian_turn(latitude) / prime, 0]])
+        # rows of an ErrorTerm, by place and attitude in ITRS
+        slope = np.zeros((6, 6))
+        slope[:2, :3] = enu[:2]
+        slope[3:, :3] = -carried @ enu[:2]
+        slope[3:, 3:] = enu
+        slope[2] = heading_row(attitude) @ slope[3:]
+        columns = np.r_[PLACE, TURN]
+        own = ErrorTerm("adjustment", slope @ symmetric_root(covariance[np.ix_(columns, columns)]))
+        earth = earth_state(self.utc_unix_s)
+        terms = own, *time_terms(latitude, earth, self.clock_stddev_s, self.stamp_stddev_s)
+        return VoyageFix(
+            utc_unix_s=self.utc_unix_s,
+            latitude=latitude,
+            longitude=longitude,
+            heading=heading_of(attitude),
+            terms=terms,
+            velocity=enu @ motion.velocity[0],
+            velocity_covariance=enu @ covariance[VELOCITY, VELOCITY] @ enu.T,
+            link=Attitude(attitude, total_covariance(terms)[3:, 3:], of=LINK, into=ENU),
+            gyro_bias=motion.gyro_bias[0],
+            accel_bias=motion.accel_bias[0],
+        )
 
     def carried_on(self, imu: ImuLog, until_s: float) -> "Estimate":
         """The estimate at a time after its own, by the readings until then; what is missing of them widens it."""
         there = self
-        for time_s in nodes_of(np.array([self.utc_unix_s, until_s]), LONGEST_S)[1:]:
+        for time_s in nodes_of(np.array([self.utc_unix_s, until_s]))[1:]:
             there = there._next(imu, time_s)
         return there
 
@@ -162,26 +150,18 @@ BIAS, CAMERA, MOTION, WHOLE = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Observability:
-    """What is known of the place, 1 sigma an axis in m, and what is missing, '' where that is enough."""
+def observability(estimate: Estimate, measured: bool) -> tuple[float, str]:
+    """1 sigma of the place, m an axis, and a sentence on what is missing, '' where nothing is.
 
-    sigma_m: float
-    missing: str
-
-
-def observability(estimate: Estimate, measured: bool) -> Observability:
-    """Which unknown an estimate's place depends on: by how much its error would shrink if that were known.
-
+    That is the unknown which the place depends on most: by how much its error would shrink if it were known.
     measured: whether a velocity is measured, so that nothing else would determine it.
     """
     covariance = estimate.covariance
-    latitude, longitude, _ = (float(x) for x in geodetic_place(estimate.motion.place[0]))
-    level = enu_axes(latitude, longitude)[:2]
+    level = enu_at(estimate.motion.place[0])[:2]
     place = level @ covariance[PLACE, PLACE] @ level.T
     sigma_m = float(np.sqrt(np.trace(place) / 2))
     if sigma_m < ENOUGH_M:
-        return Observability(sigma_m=sigma_m, missing="")
+        return sigma_m, ""
     n = estimate.unknowns
     speed = np.r_[VELOCITY, SPEED, DRIFT] if n == BY_LAW else np.r_[VELOCITY]
     groups = {BIAS: np.r_[ACCEL_BIAS], CAMERA: n + np.r_[MOUNT]} | ({} if measured else {MOTION: speed})
@@ -191,4 +171,4 @@ def observability(estimate: Estimate, measured: bool) -> Observability:
         told = across @ np.linalg.pinv(covariance[np.ix_(columns, columns)]) @ across.T
         share[sentence] = float(np.trace(told) / np.trace(place))
     most = max(share, key=lambda sentence: share[sentence])
-    return Observability(sigma_m=sigma_m, missing=most if share[most] > SHARE else WHOLE)
+    return sigma_m, most if share[most] > SHARE else WHOLE

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starpos.earth.ellipsoid import enu_axes
-from starpos.earth.gravity import geodetic_place, zenith_at
+from starpos.earth.gravity import enu_at, zenith_at
+from starpos.frozen import ArrayRows
 from starpos.navigation.chain import Smoothed
 from starpos.navigation.equations import Motion, Residuals, StarAttitudes
 from starpos.navigation.preintegration import Pieces
@@ -39,7 +39,7 @@ MIN_LEFT = 1e-5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Standstills:
+class Standstills(ArrayRows):
     """J standstills: the nodes first to last (J,) of each, both included."""
 
     first: np.ndarray
@@ -64,10 +64,6 @@ class Standstills:
         edges[self.first] += 1
         edges[self.last] -= 1
         return np.cumsum(edges)[:-1] > 0
-
-    def but(self, keep: np.ndarray) -> "Standstills":
-        """Some of them, by a mask (J,)."""
-        return Standstills(first=self.first[keep], last=self.last[keep])
 
 
 NOWHERE = Standstills(first=np.zeros(0, int), last=np.zeros(0, int))
@@ -204,8 +200,7 @@ def borne_out(law: MotionLaw, motion: Motion) -> MotionLaw:
     # level, across the nose, and the velocity along it
     side = normalised(np.cross(zenith_at(motion.place), motion.attitude[:, :, 0]))
     across = np.einsum("ki,ki->k", side, motion.velocity)
-    latitude, longitude, _ = (float(x) for x in geodetic_place(motion.place[len(motion) // 2]))
-    means = independent_means(t, side @ enu_axes(latitude, longitude)[:2].T, across, number)
+    means = independent_means(t, side @ enu_at(motion.place[len(motion) // 2])[:2].T, across, number)
     rest = law.rest_stddev * law.longer(float(np.median(np.diff(t))))
     trend = law.drift_walk / t[-1] ** 0.5
     white = (WALKS[:, None, None] * law.drift_walk) ** 2 * means.walks + (RESTS[:, None] * rest) ** 2

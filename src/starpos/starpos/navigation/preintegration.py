@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from starpos.navigation.records import GAP, ImuLog
 
+# readings are joined to so long ones
+READING_S = 0.02
 # shorter pieces of a reading are the rounding of its stamp
 SHORTEST_S = 1e-6
 # gyro's or accelerometer's bias (3) and matrix (9), row-major
@@ -109,11 +111,8 @@ def summed(
     angle = rate * length[..., None]
     whole = Rotation.from_rotvec(angle.reshape(-1, 3)).as_matrix().reshape(intervals, most, 3, 3)
     half = Rotation.from_rotvec(angle.reshape(-1, 3) / 2).as_matrix().reshape(intervals, most, 3, 3)
-    turn, speed, way = (
-        np.tile(np.eye(3), (intervals, 1, 1)),
-        np.zeros((intervals, 3)),
-        np.zeros((intervals, 3)),
-    )
+    turn = np.tile(np.eye(3), (intervals, 1, 1))
+    speed, way = np.zeros((2, intervals, 3))
     turns, speeds = np.empty((intervals, most, 3, 3)), np.empty((intervals, most, 3))
     turn_slope = np.zeros((intervals, 3, ERRORS))
     speed_slope, way_slope = np.zeros((2, intervals, 3, 2 * ERRORS))
@@ -168,26 +167,23 @@ def _crossed(force: np.ndarray, turned: np.ndarray) -> np.ndarray:
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], 1)
 
 
-def thinned(imu: ImuLog, period_s: float) -> ImuLog:
-    """Join readings that end within the same period; the body turns by one of them as by its parts.
+def thinned(imu: ImuLog) -> ImuLog:
+    """Join readings that end within the same READING_S; the body turns by one of them as by its parts.
 
     A joined force is what its parts add up to, along the axes in the middle of the turn: coning and sculling of what is
     joined stay in it.  Readings on the two sides of a gap stay apart.
     """
     t, length = imu.utc_unix_s, imu.length_s
     apart = np.diff(t) > GAP * length[1:]
-    new = np.append(True, (np.diff(np.ceil((t - t[0]) / period_s - 1e-3)) != 0) | apart)
+    new = np.append(True, (np.diff(np.ceil((t - t[0]) / READING_S - 1e-3)) != 0) | apart)
     group = np.cumsum(new) - 1
     count = np.bincount(group)
     if count.max() == 1:
         return imu
     first = np.flatnonzero(new)
     place = np.arange(len(t)) - first[group]
-    turn, push, whole_s = (
-        np.tile(np.eye(3), (len(count), 1, 1)),
-        np.zeros((len(count), 3)),
-        np.zeros(len(count)),
-    )
+    turn = np.tile(np.eye(3), (len(count), 1, 1))
+    push, whole_s = np.zeros((len(count), 3)), np.zeros(len(count))
     angle = imu.gyro * length[:, None]
     half, whole = (Rotation.from_rotvec(a).as_matrix() for a in (angle / 2, angle))
     for k in range(count.max()):

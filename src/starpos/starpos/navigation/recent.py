@@ -15,8 +15,6 @@ from starpos.navigation.sightings import FrameUnderWay
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, adjust_voyage
 
-# readings are joined to so long ones
-READING_S = 0.02
 # an IMU that is silent for longer, or whose clock goes back by more, begins a new voyage
 LONGEST_GAP_S, BACK_S = 30.0, 1.0
 # of frames with stars, whatever their stamps
@@ -64,7 +62,7 @@ class RecentReadings:
         usual = min(self._usual_s, float(apart.max()))
         length = np.where((apart > GAP * usual) | (apart <= 0), usual, apart)
         log = ImuLog(utc_unix_s=t, length_s=length, gyro=block[:, 1:4], force=block[:, 4:])
-        self._blocks.append((block, thinned(log, READING_S)))
+        self._blocks.append((block, thinned(log)))
 
     def forget(self, before_s: float) -> None:
         """Leave out the blocks that end before a time."""
@@ -154,7 +152,7 @@ class Recent:
 
         def adjusted() -> Voyage:
             rows, log = np.concatenate(blocks), None
-            imu = thinned(ImuLog.of(rows[:, 0], rows[:, 1:4], rows[:, 4:]), READING_S)
+            imu = thinned(ImuLog.of(rows[:, 0], rows[:, 1:4], rows[:, 4:]))
             if len(velocities):
                 t, velocity, sigma = velocities[:, 0], velocities[:, 1:4], velocities[:, 4]
                 log = VelocityLog(utc_unix_s=t, velocity=velocity, sigma=sigma)

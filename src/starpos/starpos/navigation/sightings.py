@@ -15,7 +15,7 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
-from starpos.fix.attitude import CAMERA, ENU, GCRS, ITRS, LINK, Attitude, CameraAttitude
+from starpos.fix.attitude import CAMERA, ENU, ITRS, LINK, Attitude, CameraAttitude
 from starpos.fix.heading import zenith_moved
 from starpos.fix.sighting import Sighting
 from starpos.fix.solution import Solution
@@ -64,13 +64,12 @@ class PlacelessFrame(FrameUnderWay):
     def of(cls, attitude: CameraAttitude) -> "PlacelessFrame":
         """The frame of an attitude that has a time; TimeError outside the IERS tables."""
         assert attitude.utc_unix_s is not None
-        turn = attitude.camera_to_gcrs
-        among_stars = Attitude(turn, turn @ attitude.covariance @ turn.T, of=CAMERA, into=GCRS)
+        turn = earth_state(attitude.utc_unix_s).gcrs_to_itrs @ attitude.camera_to_gcrs
         return cls(
             utc_unix_s=attitude.utc_unix_s,
             stamp_stddev_s=attitude.stamp_stddev_s,
             clock_stddev_s=attitude.clock_stddev_s,
-            camera=among_stars.then(earth_state(attitude.utc_unix_s).gcrs_to_itrs, ITRS),
+            camera=Attitude.by_own(turn, attitude.covariance, of=CAMERA, into=ITRS),
         )
 
     def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> tuple[Attitude, np.ndarray]:
@@ -93,7 +92,7 @@ class PlacelessFrame(FrameUnderWay):
         squeezed = float(np.linalg.norm(raised)) * np.sqrt(1 - min(height, 1.0) ** 2) / height
         uneven = squeezed * np.array([OFF_AXIS, OFF_AXIS, SPREAD])
         whole = covariance + np.diag(uneven**2)
-        return Attitude(camera, camera @ whole @ camera.T, of=CAMERA, into=ITRS), raised
+        return Attitude.by_own(camera, whole, of=CAMERA, into=ITRS), raised
 
 
 def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> PlacelessFrame:
@@ -147,7 +146,7 @@ def placeless(xy: np.ndarray, covariance_px2: np.ndarray, optics: Camera, itrs: 
     FixError if the stars disagree.
     """
     seen = fit_seen(xy, covariance_px2, optics, itrs)
-    return Attitude(np.eye(3), seen.own, of=CAMERA, into=CAMERA).then(seen.fit.a4.T, ITRS)
+    return Attitude.by_own(seen.fit.a4.T, seen.own, of=CAMERA, into=ITRS)
 
 
 # how far a direction that is said to be the Sun's may be from it, rad
@@ -179,7 +178,7 @@ class SunFrame(FrameUnderWay):
             utc_unix_s=seen.utc_unix_s,
             stamp_stddev_s=seen.stamp_stddev_s,
             clock_stddev_s=seen.clock_stddev_s,
-            camera=Attitude(turn, turn @ seen.covariance @ turn.T, of=CAMERA, into=ITRS),
+            camera=Attitude.by_own(turn, seen.covariance, of=CAMERA, into=ITRS),
             ray=seen.ray,
             body=body,
             place=place,

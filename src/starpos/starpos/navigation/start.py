@@ -37,18 +37,8 @@ AROUND, SUN_SIGMAS, MOON_APART = 3, 4.0, np.radians(2.0)
 UNITS = {"deg/s": np.degrees(1.0), "rev/min": 30 / np.pi}
 
 
-def check_readings(
-    stars: StarAttitudes, pieces: Pieces, sums: Sums, model: ImuModel, camera_to_body: np.ndarray
-) -> None:
-    """Raise VoyageError where gravity is missing, or turns and forces do not match the camera's.
-
-    sums are of the unchanged readings.
-    """
-    _check_gravity(pieces, sums, model, camera_to_body)
-    _check_turns(stars, pieces, model, camera_to_body)
-
-
-def _check_gravity(pieces: Pieces, sums: Sums, model: ImuModel, camera_to_body: np.ndarray) -> None:
+def check_gravity(pieces: Pieces, sums: Sums, model: ImuModel, camera_to_body: np.ndarray) -> None:
+    """Raise VoyageError where gravity is missing, or below the camera; sums are of the unchanged readings."""
     whole = pieces.missing_s < pieces.span_s / 2
     if not whole.any():
         raise VoyageError(
@@ -73,12 +63,11 @@ def _check_gravity(pieces: Pieces, sums: Sums, model: ImuModel, camera_to_body: 
         )
 
 
-def _check_turns(stars: StarAttitudes, pieces: Pieces, model: ImuModel, camera_to_body: np.ndarray) -> None:
-    """Compare the turns between neighbouring frames, by the stars and by the gyro."""
-    first = stars.index[:-1][np.diff(stars.index) == 1]
+def check_turns(stars: StarAttitudes, pieces: Pieces, model: ImuModel, camera_to_body: np.ndarray) -> None:
+    """Raise VoyageError where the turns between neighbouring frames differ, by the stars and by the gyro."""
     near = np.flatnonzero(np.diff(stars.index) == 1)
-    use = pieces.missing_s[first] == 0
-    first, near = first[use], near[use]
+    near = near[pieces.missing_s[stars.index[near]] == 0]
+    first = stars.index[near]
     if len(first) < 3:
         return
     body = stars.camera_to_itrs @ camera_to_body.T
@@ -202,13 +191,15 @@ def _cause(seen: np.ndarray, felt: np.ndarray) -> str:
     return best or "check its axes and its unit, and that the clocks of camera and IMU agree"
 
 
-def nodes_of(frames: np.ndarray, most_apart_s: float) -> np.ndarray:
-    """Times (K,) of nodes: the frames' times (F,), in order, and others between, so that no gap is longer."""
-    parts = np.maximum(np.ceil(np.diff(frames) / most_apart_s).astype(int), 1)
-    begin, step = np.repeat(frames[:-1], parts), np.repeat(np.diff(frames) / parts, parts)
-    return np.append(
-        begin + step * (np.arange(len(begin)) - np.repeat(np.cumsum(parts) - parts, parts)), frames[-1]
-    )
+# the equations from one node to the next hold for so long
+MAX_APART_S = 1.5
+
+
+def nodes_of(frames: np.ndarray) -> np.ndarray:
+    """Times (K,) of nodes: the frames' times (F,), in order, and others between, none farther apart than MAX_APART_S."""
+    parts = np.maximum(np.ceil(np.diff(frames) / MAX_APART_S).astype(int), 1)
+    numbers = np.append(0, np.cumsum(parts))
+    return np.interp(np.arange(numbers[-1] + 1), numbers, frames)
 
 
 def first_motion(
@@ -226,12 +217,8 @@ def first_motion(
     latitude, longitude = place_of_zenith(normalised(force))
     velocity = np.zeros((count, 3))
     if odometry is not None:
-        number = np.maximum(np.bincount(odometry.node, minlength=count), 1)
-        mean = (
-            np.stack([np.bincount(odometry.node, part, count) for part in odometry.velocity.T], -1)
-            / number[:, None]
-        )
-        velocity = np.einsum("kij,kj->ki", attitude, mean)
+        number, total = odometry.totals(np.ones(len(odometry.node)), odometry.velocity, count)
+        velocity = np.einsum("kij,kj->ki", attitude, total / np.maximum(number, 1)[:, None])
     way = np.cumsum(velocity[:-1] * pieces.span_s[:, None], axis=0)
     return Motion(
         utc_unix_s=nodes,

@@ -72,17 +72,16 @@ class Vessel:
     height_m: float = 500.0
     height_stddev_m: float = 2000.0
 
-    @property
-    def law(self) -> MotionLaw:
-        """How its speed changes where nothing measures it."""
+    def law(self, measured: bool) -> MotionLaw | None:
+        """How speed and drift change; measured: whether velocities are. None where the velocity over ground is known."""
+        if measured and self.drift_stddev > 0:
+            # of the water or air against which they are measured
+            walk = DRIFT_CHANGE * self.drift_stddev / DRIFT_CHANGE_S**0.5
+            return replace(LAWS[PARKED], drift_stddev=self.drift_stddev, drift_walk=walk)
+        if measured or self.vehicle == PARKED:
+            return None
         return ANYTHING if self.vehicle is None else LAWS[self.vehicle]
 
     def clock_stddev_of(self, frames: Iterable[Sighting]) -> float:
         """The error (s, 1 sigma) of the clock that stamped these frames, which they share."""
         return max(self.clock_stddev_s, *(f.clock_stddev_s for f in frames))
-
-    @property
-    def carried(self) -> MotionLaw:
-        """How the drift changes where velocities are measured against water or air."""
-        walk = DRIFT_CHANGE * self.drift_stddev / DRIFT_CHANGE_S**0.5
-        return replace(LAWS[PARKED], drift_stddev=self.drift_stddev, drift_walk=walk)

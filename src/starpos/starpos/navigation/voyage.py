@@ -26,19 +26,18 @@ from starpos.navigation.equations import (
     Odometry,
     Residuals,
     StarAttitudes,
+    known_residuals,
     law_residuals,
     links_of,
-    place_residuals,
     prior_rows,
     standing_residuals,
     star_residuals,
     sums_of,
 )
-from starpos.navigation.estimate import Estimate, VoyageFix, fix_of
+from starpos.navigation.estimate import Estimate, VoyageFix
 from starpos.navigation.evidence import (
     MIN_STANDSTILLS,
     NOWHERE,
-    Standstills,
     borne_out,
     by_the_rest,
     judged_by,
@@ -49,7 +48,7 @@ from starpos.navigation.preintegration import Pieces, summed
 from starpos.navigation.records import ImuLog, VelocityLog
 from starpos.navigation.sightings import FrameUnderWay, SunFrame
 from starpos.navigation.start import first_motion, nodes_of
-from starpos.navigation.vessel import PARKED, ROVER, MotionLaw, Vessel
+from starpos.navigation.vessel import PARKED, ROVER, Vessel
 from starpos.progress import Progress, quiet
 from starpos.rotation import normalised
 from starpos.units import ARCSEC
@@ -95,17 +94,16 @@ class Adjustment:
         self,
         frames: Sequence[FrameUnderWay],
         nodes: np.ndarray,
-        pieces: Pieces,
+        imu: ImuLog,
         velocity: VelocityLog | None,
         vessel: Vessel,
-        vibration: float,
     ) -> None:
-        self.frames, self.nodes, self.pieces, self.vessel = frames, nodes, pieces, vessel
-        self.vibration = vibration
-        self.odometry = None if velocity is None else Odometry.of(velocity, nodes, pieces)
+        self.frames, self.nodes, self.vessel = frames, nodes, vessel
+        self.pieces, self.vibration = Pieces.cut(imu, nodes), imu.vibration
+        self.odometry = None if velocity is None else Odometry.of(velocity, nodes, self.pieces)
         if self.odometry is not None and not len(self.odometry.node):
             raise VoyageError("no velocity lies on the voyage: check that its clock and the camera's agree")
-        self.law = self._law(vessel)
+        self.law = vessel.law(measured=self.odometry is not None)
         self.unknowns = MEASURED if self.law is None else BY_LAW
         self.model = vessel.model
         self.excess = dict.fromkeys(("frames", "places", "velocities", "forces", "forces at rest"), 1.0)
@@ -116,16 +114,9 @@ class Adjustment:
         self.slipped = np.zeros(0 if self.odometry is None else len(self.odometry.node), bool)
         self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in self.excess}
         self.strays = 0
-        # where it stands, None before it is looked for; and whether the rest of the record contradicts that it does
-        self.standing: Standstills | None = (
-            None if self.odometry is None and vessel.vehicle == ROVER else NOWHERE
-        )
-        self.contradicted = False
-
-    def _law(self, vessel: Vessel) -> MotionLaw | None:
-        if self.odometry is not None:
-            return vessel.carried if vessel.drift_stddev > 0 else None
-        return None if vessel.vehicle == PARKED else vessel.law
+        # where it stands, once that is looked for; and whether the rest of the record contradicts that it does
+        self.standing, self.contradicted = NOWHERE, False
+        self.looked_for = self.odometry is not None or vessel.vehicle != ROVER
 
     @property
     def left_out(self) -> dict[str, int]:
@@ -206,10 +197,10 @@ class Adjustment:
         zero, none = np.zeros((len(self.nodes) - 1, 3)), np.zeros((3, 3))
         sums = summed(self.pieces, zero, zero, none, none)
         believed = self.vessel.camera_to_body
-        told = self.pieces, sums, self.model, believed
-        start.check_readings(stars.part(stars.whole), *told)
-        stray = np.zeros(len(self.frames), bool)
-        stray[stars.whole] = start.stray_frames(stars.part(stars.whole), *told)
+        start.check_gravity(self.pieces, sums, self.model, believed)
+        whole, stray = stars.select(stars.whole), np.zeros(len(self.frames), bool)
+        start.check_turns(whole, self.pieces, self.model, believed)
+        stray[stars.whole] = start.stray_frames(whole, self.pieces, sums, self.model, believed)
         if stray.any():
             self.strays = int(stray.sum())
             self.frames = [frame for frame, wrong in zip(self.frames, stray, strict=True) if not wrong]
@@ -264,7 +255,7 @@ class Adjustment:
         """Whether the motion, settled, changes what is believed of noise, law or standstills."""
         weighed = self._weighed(motion, chain, links)
         # standstills are judged by the law alone at first, and again by what is known in the end
-        judged = self.standing is not None and weighed
+        judged = self.looked_for and weighed
         return weighed if judged else self._stopped(motion, chain, stars) or weighed
 
     def _fitted(
@@ -288,16 +279,16 @@ class Adjustment:
 
     def _stopped(self, motion: Motion, chain: Chain, stars: StarAttitudes) -> bool:
         """Whether it is believed to stand elsewhere than before: where it seems to, and the rest bears that out."""
-        before = len(self.standing or NOWHERE)
-        seeming = standstills(stars, self.pieces) if self.standing is None else self.standing
+        before = len(self.standing)
+        seeming = self.standing if self.looked_for else standstills(stars, self.pieces)
         if len(seeming):
             trial = standing_residuals(motion, seeming.middle, TRIAL_SIGMA, self.unknowns)
             nodes = np.concatenate([chain.nodes[:, : -trial.rows.shape[1]], self._by_law(motion, trial)], 1)
             rest = by_the_rest(trial, TRIAL_SIGMA, smoothed(replace(chain, nodes=nodes)))
             checked, contradicted = judged_by(*rest, TRIAL_SIGMA)
             self.contradicted |= contradicted
-            seeming = seeming.but(checked & (checked.sum() >= MIN_STANDSTILLS and not contradicted))
-        self.standing = seeming
+            seeming = seeming.select(checked & (checked.sum() >= MIN_STANDSTILLS and not contradicted))
+        self.standing, self.looked_for = seeming, True
         return len(seeming) != before
 
     def _weighed(self, motion: Motion, chain: Chain, links: Links) -> bool:
@@ -309,7 +300,7 @@ class Adjustment:
             self._weigh(chain, links)
             self.noise_weighed = True
             return True
-        stated = self._law(self.vessel)
+        stated = self.vessel.law(measured=False)
         if self.odometry is not None or self.law is None or stated is None or self.weighings == MAX_WEIGHINGS:
             return False
         self.weighings += 1
@@ -323,7 +314,7 @@ class Adjustment:
     def _weigh(self, chain: Chain, links: Links) -> None:
         """Raise the accelerometer's noise to what the voyage shows: of vibration some is left in sums."""
         stated2 = self.model.accelerometer_noise_density**2
-        at_rest = max(1.0, noise_density2(self.pieces, self.standing or NOWHERE) / stated2)
+        at_rest = max(1.0, noise_density2(self.pieces, self.standing) / stated2)
         unlikely = UNLIKELY_BY_LAW if self.odometry is None else UNLIKELY
         factors: list[float] = []
         likely: list[float] = []
@@ -343,7 +334,7 @@ class Adjustment:
     @property
     def _shaken(self) -> np.ndarray:
         """Mask (K - 1,) of the intervals in which the vehicle is not known to stand."""
-        return ~(self.standing or NOWHERE).links(len(self.nodes))
+        return ~self.standing.links(len(self.nodes))
 
     def _attitudes(self, zenith: np.ndarray | None) -> StarAttitudes:
         """Attitudes of all frames, as seen under a zenith, or roughly."""
@@ -371,7 +362,8 @@ class Adjustment:
             level, axes = place.covariance + np.eye(2) * PLACE_M**2, place.plumb_axes
             covariance.append(axes[:2].T @ level @ axes[:2] + np.outer(axes[2], axes[2]) * sigma_m**2)
         index = np.searchsorted(self.nodes, [sun.utc_unix_s for sun in suns])
-        return place_residuals(motion, index, np.array(where), np.array(covariance), self.unknowns)
+        off = np.array(where) - motion.place[index]
+        return known_residuals(PLACE, off, index, np.array(covariance), self.unknowns)
 
     def _chain(self, motion: Motion, stars: StarAttitudes, before: Smoothed | None) -> tuple[Chain, Links]:
         """The equations about a motion, without measurements that a solution has shown to be wrong."""
@@ -390,7 +382,7 @@ class Adjustment:
             parts.append(standing_residuals(motion, np.arange(count), STANDING_SIGMA, n))
         rows = [part.whitened(count) for part in parts]
         if self.law is not None and self.odometry is None:
-            stands = standing_residuals(motion, (self.standing or NOWHERE).nodes, STANDING_SIGMA, n)
+            stands = standing_residuals(motion, self.standing.nodes, STANDING_SIGMA, n)
             rows.append(self._by_law(motion, stands))
         links = links_of(motion, sums, self.pieces, self.model, self.law)
         # what shakes the accelerometer while it drives is not there where it stands
@@ -427,10 +419,7 @@ class Adjustment:
             self.wrong[kind] = residuals.index[distance2 > OUTLIER_CHI2 * change]
             self.excess[kind] = used = used * change
         keep = ~np.isin(residuals.index, self.wrong[kind])
-        return replace(residuals, covariance=residuals.covariance * used).part(keep)
-
-
-MAX_APART_S = 1.5
+        return replace(residuals, covariance=residuals.covariance * used).select(keep)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -482,26 +471,30 @@ def adjust_voyage(
         )
     inside = (times >= begin) & (times <= end)
     asked = np.concatenate([times[inside], [f.utc_unix_s for f in within]])
-    nodes = nodes_of(np.unique(asked), MAX_APART_S)
-    adjustment = Adjustment(within, nodes, Pieces.cut(imu, nodes), velocity, vessel, imu.vibration)
+    nodes = nodes_of(np.unique(asked))
+    adjustment = Adjustment(within, nodes, imu, velocity, vessel)
     motion, solution = adjustment.settle(progress)
     stamp_s = float(np.median([f.stamp_stddev_s for f in within]))
     clock_s = vessel.clock_stddev_of(within)
+
+    def at(k: int) -> Estimate:
+        return Estimate(
+            motion=motion.part(np.array([k])),
+            covariance=solution.covariance[k],
+            model=adjustment.model,
+            law=adjustment.law,
+            clock_stddev_s=clock_s,
+            stamp_stddev_s=stamp_s,
+        )
+
     return Voyage(
         fixes=tuple(
-            fix_of(motion, k, solution.covariance[k], clock_s, stamp_s) if there else None
+            at(k).fix if there else None
             for k, there in zip(np.searchsorted(nodes, times), inside, strict=True)
         ),
         faults=(*imu.faults, *(() if velocity is None else velocity.faults), *adjustment.faults),
         excess=adjustment.excess,
         left_out=adjustment.left_out,
         motion=motion,
-        last=Estimate(
-            motion=motion.part(np.array([-1])),
-            covariance=solution.covariance[-1],
-            model=adjustment.model,
-            law=adjustment.law,
-            clock_stddev_s=clock_s,
-            stamp_stddev_s=stamp_s,
-        ),
+        last=at(-1),
     )

@@ -16,7 +16,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.night.opening import work_of
 from starpos.night.reading import Instruments, Reader
 from starpos.night.work import Solving
-from starpos.parallel.processes import Here
+from starpos.parallel.processes import in_turn
 from starpos.sky import catalogue
 from starpos.zenith.adjustment import DeflectionSession
 from starpos.zenith.doubts import checked_session
@@ -86,6 +86,6 @@ def deflection(
     assert given.instruments.instrument is not None
     mark = Place.on_ellipsoid(site[0], site[1], height_m=site[2])
     work = partial(read.on, partial(zenith_seen, given, mark))
-    answers = Here().map((work, path) for path in paths)
+    answers = in_turn((work, path) for path in paths)
     sightings = [answer for answer in answers if isinstance(answer, ZenithSighting)]
     return checked_session(sightings, given.instruments.instrument, air, mark)

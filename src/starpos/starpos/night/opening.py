@@ -30,7 +30,7 @@ from starpos.night.reading import Instruments, Reader, TiltFile
 from starpos.night.remarks import of_gravity, of_tilts
 from starpos.night.solving import Exposures, How, Worked, solved_night
 from starpos.night.work import Solving
-from starpos.parallel.processes import Here
+from starpos.parallel.processes import in_turn
 from starpos.progress import Progress, quiet
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def exposures(
             work = replace(work, instruments=instruments, tilts=None if none else TiltsByTime(why=str(error)))
 
     def each(work: Callable[[Frame | Stars], Any]) -> Worked:
-        answers = Here().map((partial(read.on, work), str(path)) for path in frames)
+        answers = in_turn((partial(read.on, work), str(path)) for path in frames)
         return zip((path.name for path in frames), answers, strict=True)
 
     kind = "lists of stars" if frames[0].suffix == ".csv" else "frames"

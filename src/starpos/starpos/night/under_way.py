@@ -22,7 +22,7 @@ from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, adjust_voyage
 from starpos.night.reading import Instruments, Reader
 from starpos.night.work import Solving
-from starpos.parallel.processes import Here
+from starpos.parallel.processes import in_turn
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
 
@@ -156,5 +156,5 @@ def navigate(
     air = Atmosphere.measured(None, None) if atmosphere is None else atmosphere
     vessel, _ = vessel_of(whole, air, axis, **assumed)
     work = partial(read.on, partial(voyage_frame, Instruments(whole)))
-    placed = voyage_frames(Here().map((work, path) for path in paths))
+    placed = voyage_frames(in_turn((work, path) for path in paths))
     return voyage_of(placed, str(imu), None if velocity is None else str(velocity), vessel, progress)

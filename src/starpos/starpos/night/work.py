@@ -29,7 +29,7 @@ from starpos.sky.bodies import ERFA, SolarSystem
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
-    from starpos.satellites.frames import FrameTrails
+    from starpos.satellites.trails import SatelliteTrail
 
 # Share by which a photograph's focal length may differ from its EXIF's, rounded to 1 mm of a 35 mm film's: 4 % of 13 mm.
 CUT_OUT = 0.06
@@ -244,10 +244,12 @@ def identify(
     return Solving(given, search_s=search_s, progress=progress)(item).solution
 
 
-def trails_seen(solving: Solving, item: Frame | Stars) -> "tuple[searching.Sight, FrameTrails] | Solution":
-    """A frame that is identified by every way there is, and its satellites' trails; FrameError for a list of stars.
+def trails_seen(
+    solving: Solving, item: Frame | Stars
+) -> "tuple[searching.Sight, list[SatelliteTrail], str] | Solution":
+    """A frame that is identified by every way there is, its satellites' trails, and a sentence on those left out.
 
-    A frame's fault is a Solution that gives the reason.
+    A frame's fault is a Solution that gives the reason; FrameError for a list of stars.
     """
     from starpos.satellites.frames import trails_of
 
@@ -257,7 +259,7 @@ def trails_seen(solving: Solving, item: Frame | Stars) -> "tuple[searching.Sight
     known = sight.instrument or solving.instruments.of(item)
     stars = sight.stars if known is None else replace(sight.stars, shutter=known.shutter or item.shutter)
     try:
-        found = trails_of(item, stars, sight.solution, catalogue.load_catalogue())
-        return replace(sight, stars=stars, instrument=known), found
+        found, left_out = trails_of(item, stars, sight.solution, catalogue.load_catalogue())
+        return replace(sight, stars=stars, instrument=known), found, left_out
     except StarposError as error:
         return Solution.refused(stars, error)

@@ -40,6 +40,8 @@ ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
 Files = str | tuple[str, ...]
 # The work and its argument, which can be pickled: a file or files, or anything else.
 Call = tuple[Callable[[Any], Any], Any]
+# Does calls, and yields their answers in the same order.
+DoCalls = Callable[[Iterable[Call]], Iterator]
 # The warnings that the work gave, and its pickled answer.
 _Said = tuple[Sequence[str], bytes]
 
@@ -73,21 +75,12 @@ def answer_of(outcome: bytes) -> Any:
     return answer
 
 
-class Here:
-    """Workers in this process: one call after the other."""
+def in_turn(calls: Iterable[Call]) -> Iterator:
+    """Do calls in this process, one after the other; yield the answers, each as soon as all before it are there.
 
-    def __enter__(self) -> "Here":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def map(self, calls: Iterable[Call]) -> Iterator:
-        """Yield the answers in the order of the calls, each as soon as all before it are there.
-
-        A FrameError is an answer; any other StarposError of the work is raised.
-        """
-        return (answer_of(worked(*call)) for call in calls)
+    A FrameError is an answer; any other StarposError of the work is raised.
+    """
+    return (answer_of(worked(*call)) for call in calls)
 
 
 class ProcessError(StarposError):
@@ -146,7 +139,7 @@ class Processes:
         self._idle.put(worker)
 
     def map(self, calls: Iterable[Call]) -> Iterator:
-        """Yield the answers as `Here.map` does."""
+        """Yield the answers as `in_turn` does."""
         coming = iter(calls)
         under_way: deque[tuple[Call, Future[_Said | str]]] = deque()
         while True:
@@ -198,13 +191,14 @@ class Processes:
         )
 
 
-# Where calls are done: a context manager that leaves nothing running.
-Workers = Here | Processes
-
-
-def workers(number: int) -> Workers:
-    """Processes of that number, or this one alone."""
-    return Here() if number <= 1 else Processes(number)
+@contextmanager
+def workers(number: int) -> Iterator[DoCalls]:
+    """What does calls as `in_turn`: a number of processes, which end with the context, or this one alone."""
+    if number <= 1:
+        yield in_turn
+    else:
+        with Processes(number) as processes:
+            yield processes.map
 
 
 class _Worker:

@@ -8,15 +8,17 @@ and one radially. Each has a prior by its class and age, and is eliminated from 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from scipy import special
 
-from starpos.earth.gravity import geodetic_place
+from starpos.earth.gravity import enu_at, geodetic_place, itrs_place
+from starpos.earth.place import Place
 from starpos.frozen import at_once
 from starpos.satellites.elements import Orbit
-from starpos.satellites.orbits import Moments, along_axes, enu_at, raised, seen, states
+from starpos.satellites.orbits import Moments, along_axes, raised, seen, states
 from starpos.satellites.trails import SatelliteTrail
 
 STEPS = 6
@@ -36,13 +38,12 @@ UNKNOWN_HEIGHT_M = 500.0, 700.0
 
 
 class KnownBefore(NamedTuple):
-    """What is known before: height and clock (1 sigma), and a place (3,) in ITRS with a covariance (2, 2), or None."""
+    """What is known before: height and clock (1 sigma), and a place on the ellipsoid near by, or None."""
 
     height_m: float
     height_stddev_m: float
     clock_stddev_s: float
-    place: np.ndarray | None = None
-    covariance: np.ndarray | None = None
+    near: Place | None = None
 
     @classmethod
     def at_height(cls, height_m: float, stddev_m: float, clock_stddev_s: float) -> "KnownBefore":
@@ -68,13 +69,21 @@ class _Block:
     prior: np.ndarray
     total: np.ndarray
 
-    @property
+    @cached_property
     def weight(self) -> np.ndarray:
         return np.linalg.inv(self.total)
 
     def offset(self, step: np.ndarray) -> np.ndarray:
         """The satellite's offset (3,) after a step (6,) of all unknowns."""
         return self.prior @ self.by_offset.T @ self.weight @ (self.residual - self.by_place @ step)
+
+    def chance(self, trails: np.ndarray, step: np.ndarray, covariance: np.ndarray) -> float:
+        """Probability of some trails' residuals by chance, all others held: Baarda's test (1968) of a group."""
+        weight, rows = self.weight, np.isin(self.of_row, trails)
+        weighted = (weight @ (self.residual - self.by_place @ step))[rows]
+        left = weight - weight @ self.by_place @ covariance @ self.by_place.T @ weight
+        statistic = weighted @ np.linalg.pinv(left[np.ix_(rows, rows)], hermitian=True) @ weighted
+        return float(special.chdtrc(int(rows.sum()), statistic))
 
 
 @at_once
@@ -154,15 +163,15 @@ class Adjuster:
         """Adjust from a place (3,) in ITRS near the truth, and leave out what does not fit."""
         used = np.ones(len(self.time_stddev), bool)
         while True:
-            answer, blocks, step = self._adjusted(start, clock_s, used)
-            worst = self._worst(used, blocks, step, answer.covariance / answer.scale)
-            if worst is None:
+            answer, chance, worst = self._adjusted(start, clock_s, used)
+            if not chance < REFUSED or used.sum() - len(worst) < 2:
                 return answer
-            used = used & ~worst
+            used = used & ~np.isin(np.arange(len(used)), worst)
 
     def _adjusted(
         self, place: np.ndarray, clock_s: float, used: np.ndarray
-    ) -> tuple[PlaceAdjustment, list[_Block], np.ndarray]:
+    ) -> tuple[PlaceAdjustment, float, np.ndarray]:
+        """The place by the used trails; the trail, or the satellite's trails, that fits least, after its probability."""
         offsets = np.zeros((len(used), 3))
         for _ in range(STEPS):
             enu = enu_at(place)
@@ -183,10 +192,13 @@ class Adjuster:
         degrees = sum(len(block.residual) for block in blocks) + known - len(step)
         chi2 = max(chi2 - float(step @ right), 0.0)
         scale = max(chi2 / degrees, 1.0) if degrees > 0 and special.chdtrc(degrees, chi2) < SCATTER else 1.0
-        probability = np.full(len(used), np.nan)
+        probability, groups = np.full(len(used), np.nan), []
         for block in blocks:
             for trail in block.trails:
-                probability[trail] = self._chance(block, block.of_row == trail, step, covariance)
+                probability[trail] = block.chance(trail, step, covariance)
+                groups.append((probability[trail], np.array([trail])))
+            if len(block.trails) > 1:
+                groups.append((block.chance(block.trails, step, covariance), block.trails))
         offsets[~used] = np.nan
         answer = PlaceAdjustment(
             place=place,
@@ -199,16 +211,14 @@ class Adjuster:
             degrees=degrees,
             scale=scale,
         )
-        return answer, blocks, step
+        return answer, *min(groups, key=lambda group: group[0])
 
-    def fits(
-        self, place: np.ndarray, clock_s: float, covariance: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Log density (T,) of each trail at a place known by a covariance (6, 6), and its probability by chance."""
+    def fits(self, at: PlaceAdjustment) -> tuple[np.ndarray, np.ndarray]:
+        """Log densities (T,) of the trails at a place that others gave, and their probabilities by chance."""
         none = np.zeros((len(self.time_stddev), 3))
         density, probability = np.full((2, len(none)), -np.inf)
-        for block in self._blocks(self.equations(place, clock_s, none), none, np.ones(len(none), bool)):
-            total = block.total + block.by_place @ covariance @ block.by_place.T
+        for block in self._blocks(self.equations(at.place, at.clock_s, none), none, np.ones(len(none), bool)):
+            total = block.total + block.by_place @ at.covariance @ block.by_place.T
             chi2 = float(block.residual @ np.linalg.solve(total, block.residual))
             density[block.trails] = -0.5 * (chi2 + np.linalg.slogdet(total)[1])
             probability[block.trails] = special.chdtrc(len(total), chi2)
@@ -222,10 +232,10 @@ class Adjuster:
         shared = SHARED_BY_HAND**-2
         normal = np.diag([0.0, 0.0, prior.height_stddev_m**-2, prior.clock_stddev_s**-2, shared, shared])
         off = np.array([0.0, 0.0, prior.height_m - geodetic_place(place)[2], -clock_s, 0.0, 0.0])
-        if prior.place is not None and prior.covariance is not None:
-            normal[:2, :2] = np.linalg.inv(prior.covariance)
-            off[:2] = enu[:2] @ (prior.place - place)
-        return normal, normal @ off, float(off @ normal @ off), 4 if prior.place is None else 6
+        if (near := prior.near) is not None:
+            normal[:2, :2] = np.linalg.inv(near.covariance)
+            off[:2] = enu[:2] @ (itrs_place(near.latitude, near.longitude, prior.height_m) - place)
+        return normal, normal @ off, float(off @ normal @ off), 4 if near is None else 6
 
     def _blocks(
         self, equations: tuple[np.ndarray, np.ndarray, np.ndarray], offsets: np.ndarray, used: np.ndarray
@@ -257,28 +267,3 @@ class Adjuster:
                 )
             )
         return blocks
-
-    @staticmethod
-    def _chance(block: _Block, rows: np.ndarray, step: np.ndarray, covariance: np.ndarray) -> float:
-        """Probability of the residuals of some rows by chance, all others held: Baarda's test (1968) of a group."""
-        weight = block.weight
-        weighted = (weight @ (block.residual - block.by_place @ step))[rows]
-        left = weight - weight @ block.by_place @ covariance @ block.by_place.T @ weight
-        statistic = weighted @ np.linalg.pinv(left[np.ix_(rows, rows)], hermitian=True) @ weighted
-        return float(special.chdtrc(int(rows.sum()), statistic))
-
-    def _worst(
-        self, used: np.ndarray, blocks: list[_Block], step: np.ndarray, covariance: np.ndarray
-    ) -> np.ndarray | None:
-        """Mask (T,) of the trail, or of the satellite's trails, that fits least; None: all fit, or too few are left."""
-        least, worst = REFUSED, None
-        for block in blocks:
-            groups = [np.array([trail]) for trail in block.trails]
-            groups += [block.trails] if len(block.trails) > 1 else []
-            for group in groups:
-                chance = self._chance(block, np.isin(block.of_row, group), step, covariance)
-                if chance < least:
-                    least, worst = chance, group
-        if worst is None or used.sum() - len(worst) < 2:
-            return None
-        return np.isin(np.arange(len(used)), worst)

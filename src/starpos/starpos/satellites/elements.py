@@ -125,18 +125,13 @@ def read_orbits(path: Path | str) -> tuple[list[Orbit], list[str]]:
     except (OSError, UnicodeDecodeError) as e:
         reason = getattr(e, "strerror", None) or "it is no text"
         raise SatelliteError(f"{path}: no readable orbits ({reason}): {CURE}") from None
-    bad: list[str] = []
-    found = []
     try:
-        for orbit in _orbits(text):
-            if isinstance(orbit, Orbit):
-                found.append(orbit)
-            else:
-                bad.append(orbit)
+        read = list(_orbits(text))
     except (ValueError, ET.ParseError, csv.Error, StarposError) as e:
         raise SatelliteError(f"{path}: no readable orbits ({one_line(e)}): {CURE}") from None
     except ImportError:
         raise SatelliteError("orbits need the package sgp4: pip install sgp4") from None
+    found, bad = [o for o in read if isinstance(o, Orbit)], [o for o in read if isinstance(o, str)]
     if not found:
         raise SatelliteError(f"{path}: it has no orbits of satellites{f' ({bad[0]})' if bad else ''}: {CURE}")
     left = "1 is left out" if len(bad) == 1 else f"{len(bad)} are left out"
@@ -147,9 +142,7 @@ class StoredOrbits:
     """The orbits of a file or folder, read again when it changes; SatelliteError where it has none at the beginning."""
 
     def __init__(self, path: Path | str) -> None:
-        self._path = Path(path)
-        self._files: list[tuple[str, int, int]] = []
-        self.trouble = ""
+        self._path, self.trouble = Path(path), ""
         self._orbits, _ = read_orbits(self._path)
         self._files = self._seen()
 
@@ -224,11 +217,8 @@ def _from_lines(text: str) -> Iterator[Orbit | str]:
     from sgp4.io import compute_checksum
 
     lines = [line.rstrip() for line in text.splitlines()]
-    before = ""
-    number = 0
-    while number < len(lines):
-        line = lines[number]
-        number += 1
+    numbered, before = enumerate(lines, 1), ""
+    for number, line in numbered:
         if not line.startswith("1 ") or len(line) < 60:
             before = line.removeprefix("0 ").strip()
             continue
@@ -236,10 +226,10 @@ def _from_lines(text: str) -> Iterator[Orbit | str]:
         if not second.startswith("2 ") or second[2:7] != line[2:7]:
             yield f"line {number}: no second line of the same satellite follows"
             continue
-        number += 1
+        next(numbered)
         wrong = [
             n
-            for n, text_ in ((number - 1, line), (number, second))
+            for n, text_ in ((number, line), (number + 1, second))
             if text_[68:69] != str(compute_checksum(text_))
         ]
         if wrong:
@@ -248,11 +238,11 @@ def _from_lines(text: str) -> Iterator[Orbit | str]:
             try:
                 record = Satrec.twoline2rv(line, second)
                 if record.ephtype == XP:
-                    yield f"line {number - 1}: its elements are for SGP4-XP, not for SGP4"
+                    yield f"line {number}: its elements are for SGP4-XP, not for SGP4"
                 else:
                     yield _of_record(record.satnum, before, record)
             except ValueError as e:
-                yield f"line {number}: {one_line(e)}"
+                yield f"line {number + 1}: {one_line(e)}"
         before = ""
 
 
@@ -304,9 +294,11 @@ def _from_fields(row: Mapping[str, Any]) -> Orbit | str:
 
 
 def _of_states(
-    number: int, name: str, errors: OrbitErrors, rows: list[tuple[float, np.ndarray]]
+    text: str, name: str, errors: OrbitErrors, rows: list[tuple[float, np.ndarray]]
 ) -> Orbit | str:
-    """An ephemeris of times and places in GCRS."""
+    """An ephemeris of times and places in GCRS; text: the object's id."""
+    # other ids than catalogue numbers become a negative number of their own
+    number = int(text) if text.isdigit() else -sum(ord(c) << 8 * (k % 3) for k, c in enumerate(text))
     rows.sort(key=lambda row: row[0])
     times = np.array([row[0] for row in rows])
     places = np.array([row[1] for row in rows])
@@ -325,7 +317,9 @@ def _from_oem(text: str) -> Iterator[Orbit | str]:
         key, equals, value = (part.strip() for part in line.partition("="))
         if key == "META_START":
             if rows:
-                yield _of_states(_number_of(about), about.get("OBJECT_NAME", ""), CLASSES["operators"], rows)
+                yield _of_states(
+                    about.get("OBJECT_ID", ""), about.get("OBJECT_NAME", ""), CLASSES["operators"], rows
+                )
             about, rows = {}, []
         elif key.startswith("COVARIANCE_ST"):
             skipped = key == "COVARIANCE_START"
@@ -337,12 +331,6 @@ def _from_oem(text: str) -> Iterator[Orbit | str]:
             utc = _utc(_time(cells[0]), about.get("TIME_SYSTEM", "UTC"))
             place = np.array([float(cell) for cell in cells[1:4]]) * 1e3
             rows.append((utc, place @ _to_gcrs(about.get("REF_FRAME", ""), utc).T))
-
-
-def _number_of(about: Mapping[str, str]) -> int:
-    """The catalogue number, where the object's id is one; otherwise a negative number of the id's own."""
-    text = about.get("OBJECT_ID", "")
-    return int(text) if text.isdigit() else -sum(ord(c) << 8 * (k % 3) for k, c in enumerate(text))
 
 
 def _time(text: str) -> float:
@@ -404,7 +392,7 @@ def _from_sp3(text: str) -> Iterator[Orbit | str]:
             if place.any():
                 rows.setdefault(line[1:4], []).append((utc, place @ turn.T))
     for name, states in rows.items():
-        yield _of_states(_number_of({"OBJECT_ID": name}), name, CLASSES["precise"], states)
+        yield _of_states(name, name, CLASSES["precise"], states)
 
 
 def chosen(
@@ -415,7 +403,7 @@ def chosen(
     newer: also elements whose epoch is after that time.
     """
     best: dict[int, Orbit] = {}
-    left_out = {"newer": set[int](), "older": set[int]()}
+    too_new, too_old = set[int](), set[int]()
 
     def certain(orbit: Orbit) -> tuple[float, float]:
         days = abs(orbit.age_days(utc_unix_s))
@@ -423,19 +411,18 @@ def chosen(
 
     for orbit in sorted(orbits, key=certain):
         if not orbit.reaches(utc_unix_s):
-            left_out["older"].add(orbit.number)
+            too_old.add(orbit.number)
         elif orbit.ephemeris is None and orbit.epoch_unix_s > utc_unix_s and not newer:
-            left_out["newer"].add(orbit.number)
+            too_new.add(orbit.number)
         else:
             best.setdefault(orbit.number, orbit)
-    newer_only, older_only = (len(left_out[key] - set(best)) for key in ("newer", "older"))
     said = []
-    if newer_only:
+    if newer_only := len(too_new - set(best)):
         said.append(
             f"the elements of {newer_only} satellites are newer than {utc_text(utc_unix_s)}: they are used with "
             "--newer-elements alone"
         )
-    if older_only:
+    if older_only := len(too_old - set(best)):
         passive, manoeuvring = (CLASSES[name].max_age_days for name in ("passive", "manoeuvring"))
         said.append(
             f"the orbits of {older_only} satellites do not reach {utc_text(utc_unix_s)}, or are older than their class "

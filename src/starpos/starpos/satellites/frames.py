@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from starpos.earth.ellipsoid import enu_at_zenith
 from starpos.earth.orientation import earth_motion
 from starpos.errors import FrameError
 from starpos.fix.checks import check_exposure
@@ -19,7 +20,7 @@ from starpos.frames.exposure import UNKNOWN_SHUTTER
 from starpos.frames.frame import Frame, FrameTrail, Stars
 from starpos.instrument.camera import Camera
 from starpos.rotation import normalised
-from starpos.satellites.trails import SatelliteTrail, tangent_axes, turned
+from starpos.satellites.trails import SatelliteTrail, turned
 from starpos.sky.catalogue import Catalogue
 from starpos.units import SIGMA_PER_MAD
 
@@ -84,14 +85,6 @@ def _terms(xy: np.ndarray, order: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class FrameTrails:
-    """The usable trails of a frame, with tracks from 0, and a sentence on those left out; '': none."""
-
-    trails: tuple[SatelliteTrail, ...]
-    left_out: str = ""
-
-
-@dataclass(frozen=True, eq=False)
 class FrameSky:
     """The identified stars of a frame.
 
@@ -126,7 +119,7 @@ class FrameSky:
 
     def explained(self, catalogue: Catalogue) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pixels x, y and flux (N,) of all stars of the catalogue on the frame; of a wide frame, of the identified."""
-        stars, axes = self.stars, tangent_axes(self.directions.mean(0))
+        stars, axes = self.stars, enu_at_zenith(self.directions.mean(0))
         seen = self.directions @ axes.T
         if seen[:, 2].min() < COS_WIDEST or len(seen) < STARS_OF_ORDER[0]:
             return stars.x, stars.y, stars.flux
@@ -160,7 +153,7 @@ class FrameSky:
         """
         stars, middle = self.stars, trail.ends.mean(0)
         near = np.argsort(np.hypot(stars.x - middle[0], stars.y - middle[1]))[:MAX_STARS]
-        axes = tangent_axes(self.directions[near[: STARS_OF_ORDER[0]]].mean(0))
+        axes = enu_at_zenith(self.directions[near[: STARS_OF_ORDER[0]]].mean(0))
         near = near[self.directions[near] @ axes[2] > COS_FARTHEST]
         if len(near) < STARS_OF_ORDER[0]:
             raise FrameError(
@@ -176,7 +169,7 @@ class FrameSky:
             return normalised(np.column_stack([plate(pixel), np.ones(len(pixel))])) @ axes
 
         directions = at(trail.ends)
-        sky = np.stack([tangent_axes(d)[:2] for d in directions])
+        sky = np.stack([enu_at_zenith(d)[:2] for d in directions])
         step = np.eye(2) / 2
         change = np.stack([at(trail.ends + d) - at(trail.ends - d) for d in step], -1)
         turn = sky @ change
@@ -184,12 +177,13 @@ class FrameSky:
         shared = plate.variance(trail.ends)[:, None, None] * np.eye(2)
         return directions, turn @ own @ turn.transpose(0, 2, 1) + shared
 
-    def sighted(self, stars: Stars, found: Sequence[FrameTrail]) -> FrameTrails:
-        """Trails found on the frame of these stars, as seen from the ground, with the time of each end's row.
+    def sighted(self, found: Sequence[FrameTrail]) -> tuple[list[SatelliteTrail], str]:
+        """Trails found on the frame, as seen from the ground, with tracks from 0 and the time of each end's row.
 
         Of a trail that leaves the frame one end counts. One that is cut at both, or whose light is uneven, is left
-        out. FrameError with too few stars around a trail.
+        out, and a sentence, else '', says so. FrameError with too few stars around a trail.
         """
+        stars = self.stars
         trails: list[SatelliteTrail] = []
         for seen in found:
             if seen.cut.all() or not seen.steady:
@@ -223,15 +217,20 @@ class FrameSky:
         cut = len(found) - len(trails) - uneven
         why = [f"{cut} leave the frame at both ends"] * (cut > 0) + [f"{uneven} flash or fade"] * (uneven > 0)
         left_out = f"{stars.place}: of {len(found)} trails {' and '.join(why)}: left out" if why else ""
-        return FrameTrails(tuple(trails), left_out)
+        return trails, left_out
 
 
-def trails_of(frame: Frame, stars: Stars, solution: Solution, catalogue: Catalogue) -> FrameTrails:
-    """The trails on a frame whose stars were identified. FrameError without a time, an exposure or enough stars."""
+def trails_of(
+    frame: Frame, stars: Stars, solution: Solution, catalogue: Catalogue
+) -> tuple[list[SatelliteTrail], str]:
+    """The trails on a frame whose stars were identified, and a sentence, else '', on those left out.
+
+    FrameError without a time, an exposure or enough stars.
+    """
     from starpos.detection.trails import find_trails
 
     sky = FrameSky.of(stars, solution, catalogue)
-    return sky.sighted(stars, find_trails(frame, stars, *sky.explained(catalogue)))
+    return sky.sighted(find_trails(frame, stars, *sky.explained(catalogue)))
 
 
 def _later_s(stars: Stars, rows: np.ndarray) -> np.ndarray:

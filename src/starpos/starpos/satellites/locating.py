@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.earth.gravity import geodetic_place
+from starpos.earth.gravity import enu_at, geodetic_place
 from starpos.errors import SatelliteError
 from starpos.frozen import at_once
 from starpos.satellites.adjustment import Adjuster, KnownBefore, PlaceAdjustment
 from starpos.satellites.elements import Orbit
 from starpos.satellites.naming import FEWEST, Candidates, agreement, candidates, ways_of
-from starpos.satellites.orbits import enu_at
 from starpos.satellites.trails import SatelliteTrail
 
 # chi-squared of a candidate's place on the ground, from which its trail is looked at
@@ -64,24 +63,15 @@ class SatelliteFix:
 
 def locate(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: KnownBefore) -> SatelliteFix:
     """Name the trails and adjust the place; SatelliteError where they do not give one."""
-    fewest = FEWEST if prior.place is None else FEWEST - 1
+    fewest = FEWEST if prior.near is None else FEWEST - 1
     if len(trails) < fewest:
         raise SatelliteError(f"there are {len(trails)} trails: a place takes {fewest} or more")
-    found = candidates(trails, orbits, prior.height_m, prior.height_stddev_m, prior.clock_stddev_s)
-    known = found
-    if prior.place is not None and prior.covariance is not None:
-        east_north = enu_at(prior.place)[:2]
-        known = found.near(prior.place, east_north.T @ prior.covariance @ east_north)
-    agreed = agreement(known, orbits)
-    place, rows = agreed.place, agreed.members[agreed.members < len(found.trail)]
-    covariance = None
-    clock_s, seen_before = 0.0, []
-    answer: PlaceAdjustment | None = None
-    for _ in range(ROUNDS):
-        if covariance is not None:
-            rows = _named(trails, orbits, found, place, clock_s, covariance, prior)
-        if rows.tolist() in seen_before:
-            break
+    found = candidates(trails, orbits, prior)
+    near = prior.near
+    agreed = agreement(found if near is None else found.and_place(near, prior.height_m))
+    place, clock_s, rows = agreed.place, 0.0, agreed.members[agreed.members < len(found.trail)]
+    seen_before: list[list[int]] = []
+    while len(seen_before) < ROUNDS and rows.tolist() not in seen_before:
         seen_before.append(rows.tolist())
         if len(rows) < fewest:
             raise SatelliteError(
@@ -91,8 +81,7 @@ def locate(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: Kno
         adjuster = Adjuster(ways_of(trails, found, rows), [orbits[k] for k in found.orbit[rows]], prior)
         answer = adjuster.solve(place, clock_s)
         place, clock_s = answer.place, answer.clock_s
-        covariance = answer.covariance
-    assert answer is not None
+        rows = _named(trails, orbits, found, answer, prior)
     return _fix(trails, orbits, found, np.array(seen_before[-1], int), answer, fewest)
 
 
@@ -100,22 +89,19 @@ def _named(
     trails: Sequence[SatelliteTrail],
     orbits: Sequence[Orbit],
     found: Candidates,
-    place: np.ndarray,
-    clock_s: float,
-    covariance: np.ndarray,
+    at: PlaceAdjustment,
     prior: KnownBefore,
 ) -> np.ndarray:
     """Rows of the candidates that fit their trails at a place, one a trail, where no other fits nearly as well."""
-    plane = enu_at(place)[:2]
-    off = (found.places - place) @ plane.T
-    spread = plane @ found.covariance @ plane.T + covariance[:2, :2]
+    plane = enu_at(at.place)[:2]
+    off = (found.places - at.place) @ plane.T
+    spread = plane @ found.covariance @ plane.T + at.covariance[:2, :2]
     near = np.flatnonzero(np.einsum("ki,kij,kj->k", off, np.linalg.inv(spread), off) < NEAR)
     if not len(near):
         return near
     # each candidate as a satellite of its own, so that none pulls another
     own = [replace(orbits[k], number=n) for n, k in enumerate(found.orbit[near])]
-    adjuster = Adjuster(ways_of(trails, found, near), own, prior)
-    density, probability = adjuster.fits(place, clock_s, covariance)
+    density, probability = Adjuster(ways_of(trails, found, near), own, prior).fits(at)
     stated = np.array([trails[k].satellite is not None for k in found.trail[near]])
     chosen = []
     for trail in np.unique(found.trail[near]):

@@ -12,12 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.earth.ellipsoid import ECCENTRICITY2, EQUATOR_RADIUS_M
-from starpos.earth.gravity import SPIN
+from starpos.earth.gravity import SPIN, enu_at, itrs_place
+from starpos.earth.place import Place
 from starpos.errors import SatelliteError
 from starpos.frozen import at_once
 from starpos.rotation import normalised
+from starpos.satellites.adjustment import KnownBefore
 from starpos.satellites.elements import Orbit, OrbitErrors
-from starpos.satellites.orbits import Moments, along_axes, enu_at
+from starpos.satellites.orbits import Moments, along_axes
 from starpos.satellites.trails import SatelliteTrail
 from starpos.units import DAY_S, UNIX_EPOCH_JD
 
@@ -56,13 +58,16 @@ class Candidates:
     places: np.ndarray
     covariance: np.ndarray
 
-    def near(self, place: np.ndarray, covariance: np.ndarray) -> "Candidates":
-        """These, and a place (3,) in ITRS that is known, as if a trail more had given it; covariance (3, 3): of it."""
+    def and_place(self, place: Place, height_m: float) -> "Candidates":
+        """These, and a place that is known, as if a trail more had given it."""
+        east_north = place.axes[:2]
+        covariance = east_north.T @ place.covariance @ east_north
+        itrs = itrs_place(place.latitude, place.longitude, height_m)
         return Candidates(
             trail=np.append(self.trail, self.trail.max(initial=0) + 1),
             way=np.append(self.way, 0),
             orbit=np.append(self.orbit, -1),
-            places=np.concatenate([self.places, place[None]]),
+            places=np.concatenate([self.places, itrs[None]]),
             covariance=np.concatenate([self.covariance, covariance[None]]),
         )
 
@@ -126,13 +131,7 @@ class OrbitsAbove:
         return r, v - np.cross(SPIN, r)
 
 
-def candidates(
-    trails: Sequence[SatelliteTrail],
-    orbits: Sequence[Orbit],
-    height_m: float,
-    height_stddev_m: float,
-    clock_stddev_s: float,
-) -> Candidates:
+def candidates(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: KnownBefore) -> Candidates:
     """All satellites that each trail may be by its direction and motion; of a named one that satellite.
 
     A trail with one end and no name has no motion, and no candidates.
@@ -150,7 +149,7 @@ def candidates(
         else:
             continue
         for way, one in enumerate(trail.ways):
-            index, places, covariance = _of_trail(one, sky, only, height_m, height_stddev_m, clock_stddev_s)
+            index, places, covariance = _of_trail(one, sky, only, prior)
             found.append((k, way, index, places, covariance))
     counts = [len(index) for _, _, index, _, _ in found]
     return Candidates(
@@ -163,12 +162,7 @@ def candidates(
 
 
 def _of_trail(
-    trail: SatelliteTrail,
-    sky: OrbitsAbove,
-    only: np.ndarray | None,
-    height_m: float,
-    height_stddev_m: float,
-    clock_stddev_s: float,
+    trail: SatelliteTrail, sky: OrbitsAbove, only: np.ndarray | None, prior: KnownBefore
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows of orbits (K,) that a trail of a known way may be, places (K, 3) and covariances (K, 3, 3)."""
     moments = Moments.at(trail.utc_unix_s)
@@ -178,8 +172,9 @@ def _of_trail(
     rows = sky.toward(d, trail.utc_unix_s[0]) if only is None else only
     r, v = sky.at(trail.utc_unix_s[0], rows)
     # the ellipsoid at that height, stretched to a sphere
-    radius = EQUATOR_RADIUS_M + height_m
-    stretch = np.array([1.0, 1.0, radius / (EQUATOR_RADIUS_M * math.sqrt(1 - ECCENTRICITY2) + height_m)])
+    radius = EQUATOR_RADIUS_M + prior.height_m
+    polar = EQUATOR_RADIUS_M * math.sqrt(1 - ECCENTRICITY2) + prior.height_m
+    stretch = np.array([1.0, 1.0, radius / polar])
     s, e = r * stretch, d * stretch
     a, b = e @ e, s @ e
     discriminant = b**2 - a * (np.einsum("ki,ki->k", s, s) - radius**2)
@@ -194,7 +189,7 @@ def _of_trail(
     r, v, rows = r[hit], v[hit] + np.cross(SPIN, r[hit]), rows[hit]
     sigma = sky.sigma(rows, trail.utc_unix_s[0])
     sigma[:, 1] = np.hypot(
-        sigma[:, 1], np.linalg.norm(v, axis=1) * math.hypot(clock_stddev_s, trail.time_stddev_s)
+        sigma[:, 1], np.linalg.norm(v, axis=1) * math.hypot(prior.clock_stddev_s, trail.time_stddev_s)
     )
     measured = math.sqrt(np.trace(trail.covariance[0]) / 2)
     until = trail.unseen_utc_unix_s if trail.towards is not None else trail.utc_unix_s[-1]
@@ -219,7 +214,7 @@ def _of_trail(
     slide = np.eye(3) - d[:, None] * (up / sine[:, None])[:, None, :]
     axes = along_axes(r, v)
     by_orbit = slide @ np.swapaxes(axes, 1, 2) * sigma[:, None, :]
-    by_height = (d - sine[:, None] * up) / sine[:, None] * height_stddev_m
+    by_height = (d - sine[:, None] * up) / sine[:, None] * prior.height_stddev_m
     by_angle = slide * (distance * measured)[:, None, None]
     covariance = by_orbit @ np.swapaxes(by_orbit, 1, 2) + by_angle @ np.swapaxes(by_angle, 1, 2)
     covariance += by_height[:, :, None] * by_height[:, None, :] + FLOOR_M**2 * np.eye(3)
@@ -236,7 +231,7 @@ class Agreement:
     score: float
 
 
-def agreement(found: Candidates, orbits: Sequence[Orbit]) -> Agreement:
+def agreement(found: Candidates) -> Agreement:
     """The place on which most trails agree; SatelliteError if no place, or more than one, is far above chance."""
     trails = len(np.unique(found.trail))
     if trails < FEWEST:
@@ -251,20 +246,16 @@ def agreement(found: Candidates, orbits: Sequence[Orbit]) -> Agreement:
     tried = sorted(starts.tolist(), key=lambda k: -_fused(found, chance, k, steps=0).score)
     better = sorted((_fused(found, chance, k, steps=3) for k in tried[:FUSED]), key=lambda a: -a.score)
     best = better[0]
-    satellites = {orbits[k].number for k in found.orbit[best.members]}
-    if (
-        len(set(found.trail[best.members])) < FEWEST
-        or len(satellites) < 2
-        or best.score < ENOUGH + math.log(len(starts))
-    ):
+    # a known place counts as one
+    satellites = set(found.orbit[best.members].tolist())
+    if len(best.members) < FEWEST or len(satellites) < 2 or best.score < ENOUGH + math.log(len(starts)):
         raise SatelliteError(
             f"no place agrees with {FEWEST} trails: {trails} trails can be satellites of the orbits, but from different "
             "places: give orbits of that day, the height, or more trails"
         )
     for other in better[1:]:
         apart = float(np.linalg.norm(other.place - best.place))
-        mine = set(found.orbit[other.members].tolist()) & set(found.orbit[best.members].tolist())
-        if other.score > best.score - AHEAD and not mine:
+        if other.score > best.score - AHEAD and satellites.isdisjoint(found.orbit[other.members].tolist()):
             raise SatelliteError(
                 f"the trails agree with two places, {apart / 1e3:.0f} km apart: give --near, or more trails"
             )

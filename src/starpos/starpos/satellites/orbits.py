@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import SPIN, geodetic_place
 from starpos.earth.orientation import SPEED_OF_LIGHT, earth_state, later
 from starpos.earth.refraction import MIN_COS_ZENITH, STANDARD_PRESSURE_PA, Atmosphere
@@ -98,12 +97,6 @@ def raised(place: np.ndarray, directions: np.ndarray) -> np.ndarray:
     cosine = np.maximum(directions @ unit_vector(longitude, latitude), MIN_COS_ZENITH)
     bend = Atmosphere(pressure_pa=float(pressure)).refraction()
     return -bend.b * float(np.linalg.norm(place)) / cosine**2
-
-
-def enu_at(place: np.ndarray) -> np.ndarray:
-    """East, north, up (3, 3), as rows, by the ellipsoid at a place (3,) in ITRS, m."""
-    latitude, longitude, _ = geodetic_place(place)
-    return enu_axes(float(latitude), float(longitude))
 
 
 def along_axes(r: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -15,8 +15,8 @@ from starpos.rotation import normalised, unit_vector
 from starpos.satellites.elements import Orbit
 from starpos.satellites.naming import STEP_S, OrbitsAbove
 from starpos.sky.bodies import SUN, body_at
+from starpos.units import HOUR_S
 
-HOUR_S = 3600.0
 # Sine of the Sun's height, -6 deg, under which bright stars show: civil twilight ends.
 DARK = math.sin(math.radians(-6))
 # The Earth's shadow is a cylinder as wide as the Earth with the air that lets no light through, m.

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The trail of a satellite among the stars: what a frame, or an observer's table, says of it."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.earth.ellipsoid import enu_axes
-from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.earth.ellipsoid import enu_at_zenith
+from starpos.earth.orientation import later
 from starpos.frozen import at_once
 
 
@@ -70,13 +69,7 @@ class SatelliteTrail:
     @property
     def axes(self) -> np.ndarray:
         """Unit vectors (E, 2, 3) along growing right ascension and growing declination at each end."""
-        return np.stack([tangent_axes(d)[:2] for d in self.directions])
-
-
-def tangent_axes(v: np.ndarray) -> np.ndarray:
-    """Unit vectors (3, 3): towards growing right ascension and growing declination at a direction v (3,), and v's."""
-    x, y, z = v
-    return enu_axes(math.atan2(z, math.hypot(x, y)), math.atan2(y, x))
+        return np.stack([enu_at_zenith(d)[:2] for d in self.directions])
 
 
 def turned(directions: np.ndarray, seconds: np.ndarray) -> np.ndarray:
@@ -84,6 +77,5 @@ def turned(directions: np.ndarray, seconds: np.ndarray) -> np.ndarray:
 
     They turn about the axis of GCRS. The Earth's is 0.2 deg from it, which is 0.1 arcsec in 2 s.
     """
-    c, s = np.cos(ROTATION_RAD_S * seconds), np.sin(ROTATION_RAD_S * seconds)
-    x, y, z = directions.T
-    return np.stack([c * x - s * y, s * x + c * y, z], -1)
+    # as what stands still in the sky turns above the ground, the other way
+    return later(directions, -seconds)

@@ -12,8 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from starpos.earth.ellipsoid import enu_axes
-from starpos.earth.gravity import geodetic_place
+from starpos.earth.gravity import enu_at
 from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic
 from starpos.errors import GnssError, VoyageError
@@ -23,7 +22,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_attitude
 from starpos.navigation.equations import PLACE
-from starpos.navigation.estimate import Estimate, Observability, VoyageFix, observability
+from starpos.navigation.estimate import Estimate, VoyageFix, observability
 from starpos.navigation.recent import BACK_S, LONGEST_GAP_S, Recent
 from starpos.navigation.records import ImuModel, read_imu_model
 from starpos.navigation.sightings import PlacelessFrame, SunFrame, body_attitude
@@ -115,7 +114,8 @@ class NavigatorSession:
         self._estimate: Estimate | None = None
         # a frame with the Sun that the estimate is made of: then its place is a given one
         self._sun: SunFrame | None = None
-        self._known: Observability | None = None
+        # of its place, 1 sigma, and what would improve it
+        self._sigma_m, self._missing = math.inf, ""
         self._origin: np.ndarray | None = None
         self._trouble = STARTING
         self._faults: tuple[str, ...] = ()
@@ -265,13 +265,13 @@ class NavigatorSession:
         self.counts["adjustments"] += 1
         self._trouble, self._faults = made.trouble, ()
         if made.trouble:
-            self._estimate = self._known = None
+            self._estimate = None
             self._changes.say(made.trouble, good=False)
             return
         found: Voyage = made.value
         self._faults, self._sun = found.faults, sun
         self._seen_s = found.last.utc_unix_s
-        self._known = observability(found.last, self._is_measured)
+        self._sigma_m, self._missing = observability(found.last, self._is_measured)
         self._estimate = self._carried_on(found.last)
         self._changes.say("fixes are coming" if sun is None else "headings by the Sun are coming", good=True)
 
@@ -314,12 +314,11 @@ class NavigatorSession:
     def _displacement(self, estimate: Estimate) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
         """Where an estimate lies from the first place that was known well enough, with covariance; None before it."""
         place = estimate.motion.place[0]
-        if self._origin is None and self._known is not None and self._known.sigma_m < WIDE_M:
+        if self._origin is None and self._sigma_m < WIDE_M:
             self._origin = place
         if self._origin is None:
             return None, None
-        latitude, longitude, _ = (float(x) for x in geodetic_place(self._origin))
-        axes = enu_axes(latitude, longitude)
+        axes = enu_at(self._origin)
         return axes @ (place - self._origin), axes @ estimate.covariance[PLACE, PLACE] @ axes.T
 
     def _why_old(self, since_s: float) -> str:
@@ -333,20 +332,20 @@ class NavigatorSession:
 
     def report(self) -> Diagnosis:
         """Make the diagnostic `Navigation`: what is known, what is missing, how good it is."""
-        estimate, known, recent = self._estimate, self._known, self._recent
+        estimate, recent = self._estimate, self._recent
         values: dict[str, object] = {
             **self.counts,
             "frames in the window": len(recent.frames),
             "velocities in the window": len(recent.velocities),
         }
-        if estimate is None or known is None:
+        if estimate is None:
             apart = len(recent.frames) >= MIN_FRAMES and recent.newest_frame_s == -math.inf
             return Diagnosis(Level.WARN, APART if apart else self._trouble, values)
         since_s = recent.readings.last_s - self._seen_s
         speed = float(np.sqrt(np.trace(estimate.fix.velocity_covariance) / 3))
         heading_deg = math.degrees(math.sqrt(estimate.fix.covariance[2, 2]))
         values |= {
-            "place (m, 1 sigma an axis)": known.sigma_m,
+            "place (m, 1 sigma an axis)": self._sigma_m,
             "heading (deg, 1 sigma)": heading_deg,
             "velocity (m/s, 1 sigma an axis)": speed,
             "time since the newest frame that is adjusted (s)": since_s,
@@ -368,6 +367,6 @@ class NavigatorSession:
             )
             values["GNSS from here (m)"] = apart_m
             faults += [wrong] if wrong else []
-        said = [f"place to {known.sigma_m:.3g} m", *([known.missing] if known.missing else [])]
-        level = Level.WARN if known.sigma_m > WIDE_M or faults else Level.OK
+        said = [f"place to {self._sigma_m:.3g} m", *([self._missing] if self._missing else [])]
+        level = Level.WARN if self._sigma_m > WIDE_M or faults else Level.OK
         return Diagnosis(level, "; ".join([*said, *faults]), values)

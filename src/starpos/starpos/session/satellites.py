@@ -179,12 +179,12 @@ def located(
     for _, stars, answer, found in frames:
         try:
             sky = FrameSky.of(stars, answer, stars_of_sky)
-            seen = sky.sighted(stars, sky.doubted(found, stars_of_sky))
+            more, why = sky.sighted(sky.doubted(found, stars_of_sky))
         except StarposError as error:
             left_out = str(error)
         else:
-            trails += seen.trails
-            left_out = seen.left_out or left_out
+            trails += more
+            left_out = why or left_out
     stamp = frames[-1][0]
     begin = max((float(t.utc_unix_s[0]) for t in trails), default=0.0) - window_s
     kept = tuple(replace(t, track=k) for k, t in enumerate(t for t in trails if t.utc_unix_s[0] >= begin))

@@ -137,14 +137,6 @@ def draw(catalogue: Catalogue, conditions: Conditions, seed: int, number: int) -
     return Field(*blended(xy[order], mag[order], c.blend_px), attitude[2], f"seed {seed} field {number}")
 
 
-def draw_points(conditions: Conditions, seed: int, number: int) -> Field:
-    """Draw a field of random points."""
-    rng, camera = np.random.default_rng([seed, number, 1]), conditions.camera
-    n = int(rng.integers(*POINTS))
-    xy = rng.uniform(0, [camera.width - 1, camera.height - 1], (n, 2))
-    return Field(xy, np.sort(rng.uniform(4, 9, n)), None, f"seed {seed} points {number}")
-
-
 def blended(xy: np.ndarray, mag: np.ndarray, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Places and magnitudes after stars closer than reach_px were joined to the brighter one; brightest first."""
     xy, light, single = xy.copy(), 10 ** (-0.4 * mag), np.ones(len(mag), bool)
@@ -180,8 +172,12 @@ def few_stars(catalogue: Catalogue, conditions: Conditions, seed: int, n: int) -
 
 def points(conditions: Conditions, seed: int) -> Iterator[Field]:
     """Fields of random points; endless."""
+    camera = conditions.camera
     for number in count():
-        yield draw_points(conditions, seed, number)
+        rng = np.random.default_rng([seed, number, 1])
+        n = int(rng.integers(*POINTS))
+        xy = rng.uniform(0, [camera.width - 1, camera.height - 1], (n, 2))
+        yield Field(xy, np.sort(rng.uniform(4, 9, n)), None, f"seed {seed} points {number}")
 
 
 @dataclass

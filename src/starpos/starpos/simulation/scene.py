@@ -153,12 +153,7 @@ def expose(
 
 
 def render(
-    scene: Scene,
-    stars: Exposed,
-    start_unix_s: float,
-    exposure_s: float,
-    rng: np.random.Generator,
-    source: str = "simulated",
+    scene: Scene, stars: Exposed, start_unix_s: float, exposure_s: float, rng: np.random.Generator
 ) -> Frame:
     """A 16-bit frame: trailed Gaussian images integrated over pixels, sky, photon and read noise, clipping."""
     camera, optics = scene.camera, scene.optics
@@ -181,7 +176,7 @@ def render(
         pattern="",
         mid_unix_s=start_unix_s + exposure_s / 2,
         exposure_s=exposure_s,
-        source=source,
+        source="simulated",
         focal_px=camera.fx,
         shutter=scene.shutter,
     )

@@ -17,7 +17,6 @@ from functools import cached_property
 import numpy as np
 
 from starpos.earth.gravity import itrs_place, plumb_tide
-from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import plumb_curvature_arcsec_per_m
@@ -95,7 +94,6 @@ class DeflectionSession:
     chi2_per_degree: of the residuals; 1 where the stated errors and the air's explain them.
     stars (S,): rows of the catalogue.
     lines: the equations of the last step, before which the estimate was off the prior's by offset (5,).
-    by_second (N, 2): derivatives of the readings by a second of the clock, rad.
     projector (2 N, 2 N), weighted (2 N,): weights that the unknowns leave, and the weighted residuals.
 
     Examples
@@ -123,7 +121,6 @@ class DeflectionSession:
     cost: float
     lines: Lines
     offset: np.ndarray
-    by_second: np.ndarray
     projector: np.ndarray
     weighted: np.ndarray
     as_stated: "DeflectionSession | None" = None
@@ -264,7 +261,7 @@ class _Session:
 
     def errors(self, lines: Lines, inclinometer: InclinometerErrors) -> dict[str, np.ndarray]:
         since = self.given.utc_unix_s
-        return errors_of(lines, self.sightings, self.places, self.faces, inclinometer, self.mark, since)
+        return errors_of(lines, self.sightings, self.places, self.faces, inclinometer, since)
 
     def solved(self, inclinometer: InclinometerErrors, air: Air | None) -> DeflectionSession:
         """The session with a tiltmeter of these errors; air: its size, else the residuals determine it."""
@@ -272,7 +269,7 @@ class _Session:
         estimate = LeanEstimate(lean=np.zeros(2), a3=self.given.a3) if known else start_of(self.sightings)
         offset, size = np.zeros(5), air
         for _ in range(STEPS):
-            lines = Lines.at(estimate, self.sightings, self.bending)
+            lines = Lines.at(estimate, self.sightings, self.bending, self.mark)
             errors = self.errors(lines, inclinometer)
             stated = _stated(errors)
             # A3's prior stays where it was
@@ -416,7 +413,6 @@ class _Session:
             cost=fit.cost,
             lines=lines,
             offset=offset,
-            by_second=lines.by_sky @ (self.mark.axes[:, 2] * ROTATION_RAD_S),
             projector=inverse - design @ fit.covariance @ design.T,
             weighted=inverse @ left,
         )

@@ -154,7 +154,7 @@ def _off(found: DeflectionSession) -> str:
 
 def _clock(found: DeflectionSession) -> tuple[float, str]:
     """Chi-square of the likeliest jump of the clock, and the sentence about it."""
-    step, chi2, at = _steps(found, found.by_second[..., None])
+    step, chi2, at = _steps(found, found.lines.by_second[..., None])
     when = utc_text(found.sightings[at].utc_unix_s)
     return chi2, (
         f"the clock that stamps the frames seems to have jumped by {step[0]:+.3f} s before {when}: use the frames "

@@ -52,7 +52,7 @@ class Lines:
 
     off (N, 2): readings minus those that the estimate predicts, rad.
     Derivatives of the prediction: by_parameters (N, 2, 5) as in `LeanEstimate.moved`; by_camera (N, 2, 3), by a small
-    rotation of the camera about C's axes; by_sky (N, 2, 3), by one of the sky about east, north, up.
+    rotation of the camera about C's axes; by_sky (N, 2, 3), by one of the sky about ITRS's axes.
     """
 
     off: np.ndarray
@@ -65,8 +65,15 @@ class Lines:
         """Derivatives (N, 2, 2) by xi and eta, up's lean to the north and to the east."""
         return self.by_parameters[..., :2]
 
+    @property
+    def by_second(self) -> np.ndarray:
+        """Derivatives (N, 2) by a second of the clock, in which the sky turns about the pole, rad."""
+        return self.by_sky[..., 2] * ROTATION_RAD_S
+
     @classmethod
-    def at(cls, estimate: LeanEstimate, sightings: Sequence[ZenithSighting], bending: float) -> "Lines":
+    def at(
+        cls, estimate: LeanEstimate, sightings: Sequence[ZenithSighting], bending: float, mark: Place
+    ) -> "Lines":
         """The equations about an estimate.
 
         bending: refraction (rad) for 1 rad of zenith distance.  The attitudes count it from the ellipsoid's normal; light
@@ -86,14 +93,13 @@ class Lines:
             return slope[..., None] * turn[:, :2]
 
         lean = of(sensor)[..., [1, 0]] * shown
-        a3 = of(np.array([-rotation.cross_matrix(v) for v in there]))
-        in_camera = attitude @ up
-        camera = of(estimate.a3 @ np.array([-rotation.cross_matrix(v) for v in in_camera]))
+        a3 = of(-rotation.cross_matrices(there))
+        camera = of(estimate.a3 @ -rotation.cross_matrices(attitude @ up))
         return cls(
             off=theta - np.arcsin(there[:, :2]),
             by_parameters=np.concatenate([lean, a3], 2),
             by_camera=camera,
-            by_sky=of(sensor @ -rotation.cross_matrix(up)),
+            by_sky=of(sensor @ -rotation.cross_matrix(up) @ mark.axes),
         )
 
 
@@ -141,7 +147,6 @@ def errors_of(
     places: StarPlaces,
     faces: np.ndarray,
     inclinometer: InclinometerErrors,
-    mark: Place,
     since_unix_s: float,
 ) -> dict[str, np.ndarray]:
     """Covariances (2 N, 2 N) in rad2, by source, of the readings X', Y' of N frames; of the air, for errors of 1 rad.
@@ -154,7 +159,7 @@ def errors_of(
     terms = (
         *_of_tilts(sightings, faces, inclinometer, since_unix_s),
         *_of_stars(lines, sightings, places),
-        *_of_time(lines, sightings, mark),
+        *_of_time(lines, sightings),
         ErrorTerm.of_frames(MOTION, lines.by_lean, own),
         ErrorTerm.of_frames(ANOMALOUS, lines.by_lean, np.exp(-apart_s / AIR_TAU_S)),
     )
@@ -218,16 +223,12 @@ def _of_stars(lines: Lines, sightings: Sequence[ZenithSighting], places: StarPla
     ]
 
 
-def _of_time(lines: Lines, sightings: Sequence[ZenithSighting], mark: Place) -> list[ErrorTerm]:
-    # in a second the sky turns about the pole
-    second = lines.by_sky @ (mark.axes[:, 2] * ROTATION_RAD_S)
+def _of_time(lines: Lines, sightings: Sequence[ZenithSighting]) -> list[ErrorTerm]:
     clock = np.array([np.hypot(s.clock_stddev_s, s.stamp_stddev_s) for s in sightings])
     ut1 = np.array([s.orientation.ut1_sigma_s for s in sightings])
     pole = np.array([s.orientation.pole_sigma for s in sightings])
     return [
-        ErrorTerm.of_frames("clock", (second * clock[:, None])[..., None]),
-        ErrorTerm.of_frames("ut1", (second * np.hypot(ut1, DAILY_UT1_S)[:, None])[..., None]),
-        ErrorTerm.of_frames(
-            "pole", lines.by_sky @ mark.axes[:, :2] * np.hypot(pole, DAILY_POLE_RAD)[:, None, None]
-        ),
+        ErrorTerm.of_frames("clock", (lines.by_second * clock[:, None])[..., None]),
+        ErrorTerm.of_frames("ut1", (lines.by_second * np.hypot(ut1, DAILY_UT1_S)[:, None])[..., None]),
+        ErrorTerm.of_frames("pole", lines.by_sky[..., :2] * np.hypot(pole, DAILY_POLE_RAD)[:, None, None]),
     ]

@@ -73,9 +73,8 @@ class ZenithSighting(Sighting):
 
     def turned(self, turn: np.ndarray) -> "ZenithSighting":
         """Turn the camera by a rotation (3, 3) of its axes C."""
-        return replace(
-            self, camera=site_attitude(turn @ self.enu_to_camera, self.camera.covariance_about_own)
-        )
+        camera, own = self.camera.rotation @ turn.T, self.camera.covariance_about_own
+        return replace(self, camera=Attitude.by_own(camera, own, of=CAMERA, into=ENU))
 
     @property
     def heading(self) -> float:
@@ -87,15 +86,6 @@ class ZenithSighting(Sighting):
     def residual_rms_arcsec(self) -> float:
         """Root mean square of the residuals a coordinate."""
         return float(np.sqrt(np.mean(self.residual_arcsec**2)))
-
-
-def site_attitude(enu_to_camera: np.ndarray, covariance: np.ndarray) -> Attitude:
-    """Make the camera's attitude at a site, by a rotation (3, 3) of east, north, up into C.
-
-    covariance (3, 3): rad2, of its small rotation about C's axes.
-    """
-    back = enu_to_camera.T
-    return Attitude(back, back @ covariance @ enu_to_camera, of=CAMERA, into=ENU)
 
 
 def sighting(
@@ -139,7 +129,7 @@ def sighting(
     turns = fit.slope[kept, :, :3]
     rays = refraction.bend(enu)[kept] @ fit.a4.T
     # a star that is displaced moves on the frame as the camera's turn about its ray x displacement would move it
-    across = np.array([rotation.cross_matrix(ray) for ray in rays])
+    across = rotation.cross_matrices(rays)
     icrs_to_camera = fit.a4 @ mark.axes @ state.gcrs_to_itrs
     displaced_px = turns @ across @ icrs_to_camera * matched.place_sigma[kept, None, None]
     white = np.linalg.inv(np.linalg.cholesky(centroids))
@@ -153,7 +143,7 @@ def sighting(
     return ZenithSighting(
         source=stars.source,
         utc_unix_s=state.utc_unix_s,
-        camera=site_attitude(fit.a4, spread(gain, centroids)),
+        camera=Attitude.by_own(fit.a4.T, spread(gain, centroids), of=CAMERA, into=ENU),
         stars=index[kept],
         by_star=np.einsum("ing,ngj->inj", gain, displaced_px),
         star_weight=np.einsum("ngi,ngj->nij", shown, shown),
@@ -181,9 +171,7 @@ def centroids_of(residual: np.ndarray, stated: np.ndarray, placed_px: np.ndarray
 
 def _seen(stars: MatchedStars, state: EarthState, shutter: Shutter, height: int, mark: Place) -> np.ndarray:
     """Topocentric directions (N, 3) in ITRS, with the diurnal aberration, each when its row was exposed."""
-    itrs = state.to_itrs(stars.places)
-    if shutter.readout_s:
-        itrs = later(itrs, shutter.later_s(stars.xy[:, 1], height))
+    itrs = later(state.to_itrs(stars.places), shutter.later_s(stars.xy[:, 1], height))
     return rotation.normalised(itrs + station_velocity(mark.axes[2]))
 
 

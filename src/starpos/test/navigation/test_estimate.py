@@ -74,7 +74,7 @@ def test_noise_alone_widens_the_claim(record, last):
 
 def test_joined_readings_say_the_same():
     record = made("ship", 30, 2, rate_hz=400, errors=False)
-    few = thinned(record.imu, 0.02)
+    few = thinned(record.imu)
     assert few.length_s[1:-1] == pytest.approx(0.02, rel=1e-4)
     nodes, none = few.utc_unix_s[[0, 500, 1400]], np.zeros((2, 3))
     many, fewer = (
@@ -90,7 +90,7 @@ def test_readings_on_the_two_sides_of_a_gap_stay_apart(record):
     t = record.imu.utc_unix_s
     keep = (t < t[1001]) | (t > t[1203])
     log = ImuLog.of(t[keep], record.imu.gyro[keep], record.imu.force[keep])
-    few = thinned(log, 0.02)
+    few = thinned(log)
     assert few.length_s.sum() == pytest.approx(log.length_s.sum())
     begin = few.utc_unix_s - few.length_s
     assert (begin[1:] - few.utc_unix_s[:-1]).max() == pytest.approx(2.02, abs=0.011)

@@ -129,7 +129,7 @@ def test_what_the_rest_leads_to_is_a_solution_without_that_equation(rng):
 def test_standstills_are_some_of_them_by_a_mask():
     both = Standstills(first=np.array([2, 9]), last=np.array([4, 9]))
     assert both.nodes.tolist() == [2, 3, 4, 9] and both.middle.tolist() == [3, 9]
-    assert both.but(np.array([False, True])).nodes.tolist() == [9]
+    assert both.select(np.array([False, True])).nodes.tolist() == [9]
 
 
 @pytest.mark.parametrize("vehicle", ["rover", "ship", "parked", None])
@@ -137,11 +137,8 @@ def test_only_a_rover_without_odometry_is_looked_at_for_standstills(vehicle):
     record = made("rover", 20, 3, rate_hz=25)
     nodes = record.frames_s
     for velocity in (None, record.velocity):
-        adjustment = Adjustment(
-            record.frames, nodes, Pieces.cut(record.imu, nodes), velocity, vessel(vehicle), 0.0
-        )
-        looked_at = vehicle == "rover" and velocity is None
-        assert adjustment.standing is (None if looked_at else NOWHERE)
+        adjustment = Adjustment(record.frames, nodes, record.imu, velocity, vessel(vehicle))
+        assert adjustment.looked_for == (vehicle != "rover" or velocity is not None)
 
 
 def driven(drive, seed=3, noisier=1.0):

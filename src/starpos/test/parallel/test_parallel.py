@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from starpos.errors import CatalogueError, FrameError
-from starpos.parallel.processes import AHEAD, ONE_THREAD, Here, ProcessError, Processes
+from starpos.parallel.processes import AHEAD, ONE_THREAD, ProcessError, Processes, workers
 
 # the work, which goes to other processes by name
 
@@ -73,16 +73,16 @@ def test_the_same_processes_serve_again():
         assert list(workers.map([])) == []
 
 
-@pytest.mark.parametrize("workers", [Here(), Processes(2)], ids=["here", "processes"])
-def test_a_frames_failure_is_its_own_and_any_other_is_raised(workers):
-    with workers:
-        bad, broken, good = workers.map([(refused, "a.fits"), (failing, "b.fits"), (twice, 2)])
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_frames_failure_is_its_own_and_any_other_is_raised(number):
+    with workers(number) as do_calls:
+        bad, broken, good = do_calls([(refused, "a.fits"), (failing, "b.fits"), (twice, 2)])
         assert (type(bad), str(bad)) == (FrameError, "a.fits: no")
         assert str(broken).startswith("b.fits: this program failed on it (ZeroDivisionError")
         assert "test_parallel.py:" in str(broken)
         assert good == 4
         with pytest.raises(CatalogueError):
-            list(workers.map([(refused, "catalogue")]))
+            list(do_calls([(refused, "catalogue")]))
 
 
 def test_a_killed_process_costs_no_answer(tmp_path):

@@ -78,7 +78,7 @@ def chi2_of(trail, truth):
 
 def test_one_way_of_a_trail_has_its_directions_and_the_times_of_its_rows(sky, catalogue):
     frame, stars, solution, truth, ends = sky
-    (trail,) = trails_of(frame, stars, solution, catalogue).trails
+    (trail,), _ = trails_of(frame, stars, solution, catalogue)
     ways = sorted(trail.ways, key=lambda way: chi2_of(way, truth))
     # of 4 numbers
     assert len(ways) == 2 and chi2_of(ways[0], truth) < 15

@@ -97,7 +97,7 @@ def test_answers_are_counted(catalogue, conditions):
     tally, tolerance = mc.Tally(), conditions.tolerance_rad
     # A pixel of 45 arcsec.
     assert tolerance == pytest.approx(1 / FOCAL_PX)
-    given, points = mc.draw(catalogue, conditions, 1, 1), mc.draw_points(conditions, 1, 1)
+    given, points = mc.draw(catalogue, conditions, 1, 1), next(mc.points(conditions, 1))
     across = np.cross(given.centre, [0, 0, 1.0])
     beside = given.centre + across / np.linalg.norm(across) * 1.5 * tolerance
     answers = [(given, given.centre), (given, beside), (given, None), (points, None), (points, given.centre)]

@@ -10,11 +10,12 @@ from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.orientation import EarthOrientation
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
+from starpos.fix.attitude import CAMERA, ENU, Attitude
 from starpos.instrument.inclinometer import EXACT, Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.units import ARCSEC
 from starpos.zenith.adjustment import adjusted
-from starpos.zenith.sighting import ZenithSighting, site_attitude
+from starpos.zenith.sighting import ZenithSighting
 
 NOISE_ARCSEC, DRIFT_ARCSEC, SCALE = 0.05, 0.05, 1e-3
 TILTMETER = replace(
@@ -97,7 +98,7 @@ def _sighting(number, utc_unix_s, attitude, theta):
     return ZenithSighting(
         source=f"{number}.csv",
         utc_unix_s=utc_unix_s,
-        camera=site_attitude(attitude, np.diag([0.01, 0.01, 1.0]) ** 2 * ARCSEC**2),
+        camera=Attitude.by_own(attitude.T, np.diag([0.01, 0.01, 1.0]) ** 2 * ARCSEC**2, of=CAMERA, into=ENU),
         stars=np.array([7]),
         by_star=np.zeros((3, 1, 3)),
         star_weight=np.zeros((1, 3, 3)),
