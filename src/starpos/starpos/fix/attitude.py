@@ -67,18 +67,14 @@ class Attitude:
     @cached_property
     def angles_covariance(self) -> np.ndarray:
         """Covariance (3, 3) in rad2 of heading, pitch, roll; unbounded where x is vertical."""
-        slope = self._slope
-        return slope @ self.covariance @ slope.T
-
-    @property
-    def _slope(self) -> np.ndarray:
-        """Change (3, 3) of heading, pitch, roll for small rotations about east, north, up."""
+        # change of each for small rotations about east, north, up
         east, north, _ = self.rotation[:, 0].tolist()
         level = max(math.hypot(east, north), 1e-6)
         pitch = np.array([north, -east, 0.0]) / level
         # about x itself by all of it, and up to the horizon by what the heading turns
         roll = np.array([east, north, 0.0]) / level**2
-        return np.array([heading_row(self.rotation), pitch, roll])
+        slope = np.array([heading_row(self.rotation), pitch, roll])
+        return slope @ self.covariance @ slope.T
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
