@@ -26,7 +26,7 @@ from starpos.units import ARCSEC, UNIX_EPOCH_JD, unix_of
 
 EXACT = Deflection(0.0, 0.0, 0.0)
 CAMERA = Camera.from_focal(1000, 700, 4636.0)
-MOUNTING = Instrument(CAMERA.fx).mounting
+INSTRUMENT = Instrument(CAMERA.fx)
 AIR = Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
 # 2024-02-10
 NIGHT = 1707595200.0
@@ -63,7 +63,11 @@ def place(deflection=EXACT, make=Place.by_gravity, **more):
 
 def attitude_of(stars, where=None, air=AIR, clock_s=0.0, unix_s=NIGHT, **more):
     about = Circumstances(
-        camera=CAMERA, mounting=MOUNTING, atmosphere=air, earth=earth_state(unix_s), clock_stddev_s=clock_s
+        camera=CAMERA,
+        instrument=INSTRUMENT,
+        atmosphere=air,
+        earth=earth_state(unix_s),
+        clock_stddev_s=clock_s,
     )
     return attitude_at_place(stars, where or place(), replace(about, **more))
 
@@ -180,8 +184,8 @@ def test_a_wrong_place_turns_the_attitude_by_its_term():
 
 def test_mount_and_lens_are_in_the_claim():
     stars, _ = ring(200.0, 88.0, 20.0)
-    mounting = Instrument(CAMERA.fx, mount_stddev_arcsec=30.0).mounting
-    found = attitude_of(stars, mounting=mounting, axis_stddev=40 * ARCSEC)
+    instrument = Instrument(CAMERA.fx, mount_stddev_arcsec=30.0)
+    found = attitude_of(stars, instrument=instrument, axis_stddev=40 * ARCSEC)
     # a wrong optical axis looks like a lean of the camera, which looks up
     sigma = np.sqrt(np.diag(found.plumb.angles_covariance)) / ARCSEC
     assert sigma == pytest.approx([30.0, 50.0, 50.0], rel=0.01)
