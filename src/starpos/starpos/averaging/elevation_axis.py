@@ -24,7 +24,7 @@ from starpos.errors import FixError
 from starpos.fix.circle import MIN_SINE, Circle
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import angles_at
-from starpos.instrument.instrument import UNKNOWN_ARCSEC, Calibration
+from starpos.instrument.instrument import UNKNOWN_ARCSEC, VALID_DAYS, Calibration
 from starpos.units import ARCSEC
 
 # rounds of refractions and errors that follow A3, until it moves by less (rad)
@@ -38,8 +38,6 @@ MIN_RAD = 1e-9
 TRIED = 4
 # minimum number of directions that determine an axis, with the zenith known and unknown
 FEWEST, MIN_WITHOUT_SITE = 2, 4
-# how long A3 may be used
-VALID_DAYS = 365.0
 # the term of the circles that holds A3's error, which is fitted here
 OF_A3 = "calibration"
 
@@ -121,13 +119,6 @@ def find_axis(
     ray (3,): the frame's centre in C.  near: latitude, longitude (rad) that selects one of two answers.
     Raises FixError if the directions are too few, or leave two answers.
     """
-    first = Directions.of(circles_of(given.a3))
-    number, fewest = len(first.circles), MIN_WITHOUT_SITE if site is None else FEWEST
-    if number < fewest:
-        raise FixError(
-            f"elevations in {number} {'direction' if number == 1 else 'directions'} do not determine A3: without a roll "
-            f"it takes {fewest} or more (frames of a camera that stands still are one)"
-        )
     found = _axes(circles_of, given, ray, site)
     wrong = _contradicting(found[0], given, site)
     if wrong:
@@ -150,11 +141,17 @@ def find_axis(
 
 
 def _axes(circles_of: CirclesOf, given: Calibration, ray: np.ndarray, site: Place | None) -> list[FoundAxis]:
-    """The answers, the one that fits best first; FixError without any."""
+    """The answers, the one that fits best first; FixError without any, or for too few directions."""
+    first = Directions.of(circles_of(given.a3))
+    number, fewest = len(first.circles), MIN_WITHOUT_SITE if site is None else FEWEST
+    if number < fewest:
+        raise FixError(
+            f"elevations in {number} {'direction' if number == 1 else 'directions'} do not determine A3: without a roll "
+            f"it takes {fewest} or more (frames of a camera that stands still are one)"
+        )
     if site is not None:
         zeniths = [site.plumb_axes[2]]
     else:
-        first = Directions.of(circles_of(given.a3))
         tried = sorted(starts(first), key=lambda z: float(np.median(np.abs(first.residual(z)[0]))))
         zeniths = [*_round(first), *tried[:TRIED]]
     found = [_fitted(circles_of, given, ray, zenith, site) for zenith in zeniths]

@@ -28,6 +28,7 @@ from starpos.instrument.instrument import (
     OWN_LEVEL,
     SAG_ARCSEC_PER_SQRT_HOUR,
     UNKNOWN_ARCSEC,
+    VALID_DAYS,
     Calibration,
     CameraVertical,
     Instrument,
@@ -39,7 +40,6 @@ from starpos.units import ARCSEC
 
 SOLVING_ROUNDS = 4
 SETTLED_RAD = 0.02 * ARCSEC
-VALID_DAYS = 365.0
 # factor on the sigma of A3's turn from the leans that the fixes use, because both come from the same tilts
 TURN_SIGMA = 3.0
 # frames further off are left out, up to this share of all, and so often are those left judged again

@@ -36,7 +36,7 @@ class Glow:
         sigma = math.hypot(self.sigma, later.sigma)
         if went < MOVED_SIGMAS * sigma or STILL_SIGMAS * sigma < moved < STILL * went:
             return None
-        return moved < STILL * went
+        return bool(moved < STILL * went)
 
 
 class Glows:

@@ -315,11 +315,6 @@ class _Between:
         seen, true = (2 * math.asin(math.dist(*v) / 2) for v in (self.there, self.sky))
         return seen, true
 
-    @property
-    def agree(self) -> bool:
-        """Whether these two angles are the same, to their error."""
-        return abs(self.angles[0] - self.angles[1]) < SECOND_SIGMAS * self.sigma
-
 
 def _with_planet(
     shot: _Shot, disc: Disc, tilt: Tilt, place: Place | None
@@ -368,11 +363,12 @@ def _two_body_fix(looks: list[_Look], tilt: Tilt) -> Fix:
     g = level.camera
     pair = _Between.of(looks, g)
     raised, there, variances, a4 = pair.raised, pair.there, pair.variances, pair.a4
-    if not pair.agree:
-        seen_deg, true_deg = np.degrees(pair.angles)
+    seen, true = pair.angles
+    if not abs(seen - true) < SECOND_SIGMAS * pair.sigma:
         names = _named(tuple(k.body.name for k in looks))
         raise PlaceError(
-            f"{shot.stars.place}: its two bright discs are {seen_deg:.2f} deg apart, and {names} {true_deg:.2f}"
+            f"{shot.stars.place}: its two bright discs are {math.degrees(seen):.2f} deg apart, and {names} "
+            f"{math.degrees(true):.2f}"
         )
     across = axes_across(there)
     turned = [np.cross(v, c) for v, c in zip(there, across, strict=True)]

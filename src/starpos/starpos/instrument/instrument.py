@@ -167,6 +167,8 @@ class ByGravity:
 TOP_OF_FRAME = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 # 1 sigma about S's axes of an A3 without a stated error: 10 deg, and any turn about the plumb line
 UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)
+# how long an A3 that is found may be used
+VALID_DAYS = 365.0
 # Limits of a calibration: an error of several turns means unknown; no inclinometer is hotter.
 MAX_ARCSEC, MAX_C = 1e7, 200.0
 MAX_CLOCK_S = 86400.0

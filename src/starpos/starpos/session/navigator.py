@@ -161,7 +161,6 @@ class NavigatorSession:
         with refusing(self._heard, "attitude"):
             attitude = message_to_attitude(message)
             self._check_time(attitude.utc_unix_s, now, "an attitude")
-            assert attitude.utc_unix_s is not None
             by_sun, place = attitude.ray is not None, None
             if by_sun or self._estimate is None or self._stars_missing:
                 place = self._place_at(attitude.utc_unix_s)
