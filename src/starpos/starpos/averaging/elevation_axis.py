@@ -34,6 +34,8 @@ SETTLED = 1e-12
 IMPOSSIBLE = 1e12
 # an axis that is known better than this (rad) is known
 MIN_RAD = 1e-9
+# zeniths of one answer are this near (rad), however well the axis is known
+SAME_RAD = 1e-6
 # number of zeniths that are tried, the ones that fit best at first
 TRIED = 4
 # minimum number of directions that determine an axis, with the zenith known and unknown
@@ -132,7 +134,8 @@ def find_axis(
     if near is not None:
         there = rotation.unit_vector(near[1], near[0])
         return max(left, key=lambda f: float(f.zenith @ there))
-    if max(np.linalg.norm(f.zenith - best.zenith) for f in left) > 2 * EXCLUDED_SIGMA * _wide(best):
+    same = 2 * EXCLUDED_SIGMA * max(best.stddev_arcsec * ARCSEC, SAME_RAD)
+    if max(np.linalg.norm(f.zenith - best.zenith) for f in left) > same:
         raise FixError(
             "the elevations leave two places and two A3: turn the camera to directions of other altitudes too, state A3 "
             "better, or say where it is with --near LAT LON"
@@ -184,11 +187,6 @@ def _known(given: Calibration, axis: np.ndarray, across: np.ndarray) -> np.ndarr
     """Covariance (2, 2) in rad2 with which a calibration knows an axis (3,) along `across` (2, 3)."""
     turns = np.cross(axis, across)
     return turns @ given.covariance @ turns.T + MIN_RAD**2 * np.eye(2)
-
-
-def _wide(found: FoundAxis) -> float:
-    """How far (rad) a zenith may be from another that is the same answer."""
-    return float(max(np.sqrt(np.linalg.eigvalsh(found.covariance)[-1]), 1e-6))
 
 
 def _round(part: Directions) -> list[np.ndarray]:

@@ -29,7 +29,7 @@ from starpos.instrument.inclinometer import (
     stated_variances,
     up_of,
 )
-from starpos.instrument.sensors import built_in_rad, find, is_built_in, unnamed
+from starpos.instrument.sensors import built_in_rad, find, unnamed
 from starpos.instrument.tilt_log import Tilts
 from starpos.units import ARCSEC, DAY_S, utc_text
 
@@ -119,7 +119,7 @@ class ByGravity:
         if self.log is not None:
             return self.log
         assert gravity is not None
-        if gravity.model != model and is_built_in(model):
+        if gravity.model != model and built_in_rad(model):
             raise TiltError(
                 f"{frame.place}: its level is a {gravity.model}'s, the others' a {model}'s: solve them apart"
             )
@@ -481,7 +481,7 @@ class Instrument:
     @property
     def has_level_inside(self) -> bool:
         """Whether the inclinometer is a camera's own, whose axes are near the camera's."""
-        return is_built_in(self.inclinometer_model) and not self.calibration.unknown
+        return built_in_rad(self.inclinometer_model) > 0 and not self.calibration.unknown
 
     def levelled_by(self, model: str) -> "Instrument":
         """The instrument with a level of this model inside its camera, as far as A3 and the inclinometer are unknown."""
