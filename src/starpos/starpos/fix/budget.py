@@ -111,7 +111,7 @@ def tilt_terms(
     None of them has Origin.OTHER: GNSS would count it twice.
     """
     c, calibration, by_axes = instrument.calibration, np.empty((3, 4)), rows @ level.turns
-    np.matmul(level.a2, c.root, out=calibration[:, :3])
+    np.matmul(level.a2, c.covariance_root, out=calibration[:, :3])
     calibration[:, 3] = _turn_error(level, c)
     of_a3 = partial(ErrorTerm, shared=ALWAYS, constant_within_pose=True, origin=Origin.A3)
     return (

@@ -321,7 +321,7 @@ class Calibration:
         return np.asarray(self.covariance_arcsec2, float) * ARCSEC**2
 
     @cached_property
-    def root(self) -> np.ndarray:
+    def covariance_root(self) -> np.ndarray:
         """The symmetric root (3, 3) in rad of this covariance."""
         return symmetric_root(self.covariance)
 
