@@ -15,6 +15,8 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.errors import PlaceError
+from starpos.fix.attitude import CAMERA as CAMERA_AXES
+from starpos.fix.attitude import LINK
 from starpos.fix.budget import Circumstances
 from starpos.fix.heading import attitude_at_place
 from starpos.fix.solver import placed
@@ -295,7 +297,9 @@ def test_frames_through_dew_do_not_turn_the_mean_of_clear_ones(rng):
             errors = np.tile(np.eye(2) * sigma**2, (len(stars.xy), 1, 1))
             off = rng.normal(0, sigma, stars.xy.shape)
             seen.append(attitude_of(replace(stars, xy=stars.xy + off, covariance_px2=errors)))
-        mean = mean_attitude(seen).plumb
+        whole = mean_attitude(seen)
+        assert (whole.plumb.of, whole.optics.of) == (LINK, CAMERA_AXES)
+        mean = whole.plumb
         off = rotation.to_vector(mean.rotation @ link.T)
         z2.append(off @ np.linalg.solve(mean.covariance, off) / 3)
         assert np.linalg.norm(off) < 20 * ARCSEC
