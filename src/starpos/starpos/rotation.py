@@ -106,6 +106,11 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
 
 
+def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles (...) in rad between vectors a and b, both (..., 3), exact also where they are tiny or near pi."""
+    return np.arctan2(np.linalg.norm(cross(a, b), axis=-1), np.einsum("...i,...i->...", a, b))
+
+
 def cross_matrix(v: ArrayLike) -> np.ndarray:
     """The matrix (3, 3) [v]x, so that cross_matrix(v) @ w = v x w."""
     x, y, z = np.asarray(v, float).tolist()

@@ -4,6 +4,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from operator import attrgetter
 
 import numpy as np
 
@@ -62,7 +63,7 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
 
 def _solved(circles: Sequence[Circle], near: tuple[float, float] | None) -> tuple[Average, float]:
     """The place as `place_of_circles` has it, and how badly circles, and a way from near, fit: in sigma, squared."""
-    whole = Directions.of(sorted(circles, key=lambda c: c.utc_unix_s))
+    whole = Directions.of(circles)
     number = len(whole.covariance)
     if number < 2 or (number == 2 and near is None):
         raise FixError(
@@ -111,9 +112,9 @@ class Directions:
 
     @classmethod
     def of(cls, circles: Sequence[Circle]) -> "Directions":
-        """Directions of circles in order of time; FixError if they are too many."""
+        """Directions of circles in any order; FixError if they are too many."""
         groups: list[list[Circle]] = []
-        for c in circles:
+        for c in sorted(circles, key=attrgetter("utc_unix_s")):
             if groups and _alike(groups[-1][0], c):
                 groups[-1].append(c)
             else:
@@ -178,13 +179,8 @@ def _alike(a: Circle, b: Circle) -> bool:
 def _poses(groups: list[list[Circle]]) -> np.ndarray:
     """Number (D,) of each direction's pose: what moves over a camera at rest moves as far in it as on the Earth."""
     seen = np.array([g[0].ray for g in groups]), np.array([g[0].itrs for g in groups])
-    in_camera, on_earth = (np.arctan2(*_apart(v[:-1], v[1:])) for v in seen)
+    in_camera, on_earth = (rotation.angle(v[:-1], v[1:]) for v in seen)
     return np.append(0, np.cumsum(np.abs(in_camera - on_earth) > SAME_POSE_RAD))
-
-
-def _apart(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sines and cosines (N,) of the angles between unit vectors (N, 3)."""
-    return np.linalg.norm(np.cross(a, b), axis=-1), np.einsum("ni,ni->n", a, b)
 
 
 def _tilt_sources(groups: list[list[Circle]]) -> dict[str, np.ndarray]:

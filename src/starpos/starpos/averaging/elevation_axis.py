@@ -23,8 +23,8 @@ from starpos.earth.refraction import MIN_COS_ZENITH
 from starpos.errors import FixError
 from starpos.fix.circle import MIN_SINE, Circle
 from starpos.frozen import at_once
-from starpos.instrument.instrument import UNKNOWN_ARCSEC, Calibration
-from starpos.instrument.mounting import angles_at
+from starpos.instrument.inclinometer import angles_at
+from starpos.instrument.instrument import UNKNOWN_ARCSEC, VALID_DAYS, Calibration
 from starpos.units import ARCSEC
 
 # rounds of refractions and errors that follow A3, until it moves by less (rad)
@@ -34,12 +34,12 @@ SETTLED = 1e-12
 IMPOSSIBLE = 1e12
 # an axis that is known better than this (rad) is known
 MIN_RAD = 1e-9
+# zeniths of one answer are this near (rad), however well the axis is known
+SAME_RAD = 1e-6
 # number of zeniths that are tried, the ones that fit best at first
 TRIED = 4
 # minimum number of directions that determine an axis, with the zenith known and unknown
 FEWEST, MIN_WITHOUT_SITE = 2, 4
-# how long A3 may be used
-VALID_DAYS = 365.0
 # the term of the circles that holds A3's error, which is fitted here
 OF_A3 = "calibration"
 
@@ -121,13 +121,6 @@ def find_axis(
     ray (3,): the frame's centre in C.  near: latitude, longitude (rad) that selects one of two answers.
     Raises FixError if the directions are too few, or leave two answers.
     """
-    first = Directions.of(sorted(circles_of(given.a3), key=lambda c: c.utc_unix_s))
-    number, fewest = len(first.circles), MIN_WITHOUT_SITE if site is None else FEWEST
-    if number < fewest:
-        raise FixError(
-            f"elevations in {number} {'direction' if number == 1 else 'directions'} do not determine A3: without a roll "
-            f"it takes {fewest} or more (frames of a camera that stands still are one)"
-        )
     found = _axes(circles_of, given, ray, site)
     wrong = _contradicting(found[0], given, site)
     if wrong:
@@ -141,7 +134,8 @@ def find_axis(
     if near is not None:
         there = rotation.unit_vector(near[1], near[0])
         return max(left, key=lambda f: float(f.zenith @ there))
-    if max(np.linalg.norm(f.zenith - best.zenith) for f in left) > 2 * EXCLUDED_SIGMA * _wide(best):
+    same = 2 * EXCLUDED_SIGMA * max(best.stddev_arcsec * ARCSEC, SAME_RAD)
+    if max(np.linalg.norm(f.zenith - best.zenith) for f in left) > same:
         raise FixError(
             "the elevations leave two places and two A3: turn the camera to directions of other altitudes too, state A3 "
             "better, or say where it is with --near LAT LON"
@@ -150,11 +144,17 @@ def find_axis(
 
 
 def _axes(circles_of: CirclesOf, given: Calibration, ray: np.ndarray, site: Place | None) -> list[FoundAxis]:
-    """The answers, the one that fits best first; FixError without any."""
+    """The answers, the one that fits best first; FixError without any, or for too few directions."""
+    first = Directions.of(circles_of(given.a3))
+    number, fewest = len(first.circles), MIN_WITHOUT_SITE if site is None else FEWEST
+    if number < fewest:
+        raise FixError(
+            f"elevations in {number} {'direction' if number == 1 else 'directions'} do not determine A3: without a roll "
+            f"it takes {fewest} or more (frames of a camera that stands still are one)"
+        )
     if site is not None:
         zeniths = [site.plumb_axes[2]]
     else:
-        first = Directions.of(sorted(circles_of(given.a3), key=lambda c: c.utc_unix_s))
         tried = sorted(starts(first), key=lambda z: float(np.median(np.abs(first.residual(z)[0]))))
         zeniths = [*_round(first), *tried[:TRIED]]
     found = [_fitted(circles_of, given, ray, zenith, site) for zenith in zeniths]
@@ -186,13 +186,7 @@ def _contradicting(best: FoundAxis, given: Calibration, site: Place | None) -> s
 def _known(given: Calibration, axis: np.ndarray, across: np.ndarray) -> np.ndarray:
     """Covariance (2, 2) in rad2 with which a calibration knows an axis (3,) along `across` (2, 3)."""
     turns = np.cross(axis, across)
-    about = np.asarray(given.covariance_arcsec2, float) * ARCSEC**2
-    return turns @ about @ turns.T + MIN_RAD**2 * np.eye(2)
-
-
-def _wide(found: FoundAxis) -> float:
-    """How far (rad) a zenith may be from another that is the same answer."""
-    return float(max(np.sqrt(np.linalg.eigvalsh(found.covariance)[-1]), 1e-6))
+    return turns @ given.covariance @ turns.T + MIN_RAD**2 * np.eye(2)
 
 
 def _round(part: Directions) -> list[np.ndarray]:
@@ -228,11 +222,11 @@ def _solved(
 
     part, up = Directions.of(circles), np.array([c.up for c in circles])
     start = rotation.normalised(a3 @ ray)
-    bent = np.array([c.zenith_distance for c in circles]) - _seen(up, start)
+    bent = np.array([c.zenith_distance for c in circles]) - rotation.angle(up, start)
     across, along = np.linalg.svd(start[None])[2][1:], enu_at_zenith(zenith)[:2]
     stated, known = part.without(OF_A3), _known(given, start, across)
     if site is not None:
-        of_zenith = part.residual(zenith, _seen(up, start) + bent)[1]
+        of_zenith = part.residual(zenith, rotation.angle(up, start) + bent)[1]
         stated = stated + site.plumb_stddev**2 * of_zenith @ of_zenith.T
     sigma = np.sqrt(np.diag(stated))
     each = np.diag(np.diag(stated)) if robust else stated
@@ -244,10 +238,10 @@ def _solved(
 
     def left(x: np.ndarray) -> np.ndarray:
         axis, there = moved(x)
-        return part.residual(there, _seen(up, axis) + bent)[0]
+        return part.residual(there, rotation.angle(up, axis) + bent)[0]
 
     def residual(x: np.ndarray) -> np.ndarray:
-        seen = _seen(up, moved(x)[0])
+        seen = rotation.angle(up, moved(x)[0])
         if np.sin(seen).min() < MIN_SINE or np.cos(seen).min() < MIN_COS_ZENITH:
             return np.full(len(white) + 2, IMPOSSIBLE)
         # how far the axis is from where it was given, in units of what is known of it
@@ -282,11 +276,6 @@ def _solved(
         chi2=chi2,
         circles=circles,
     )
-
-
-def _seen(up: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Apparent zenith distances (N,) of an axis (3,) in S, where up (N, 3) is there."""
-    return np.arctan2(np.linalg.norm(np.cross(up, axis), axis=1), up @ axis)
 
 
 def _fitted(

@@ -2,7 +2,7 @@
 """Poses of a camera that stands still: whether it was touched, whether its time stamps slipped, and its mean attitude."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,10 +11,9 @@ from starpos._numeric.roots import symmetric_root
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.errors import FixError
 from starpos.fix.attitude import Attitude
-from starpos.fix.budget import link_attitude
 from starpos.fix.fix import Fix, angle_text
 from starpos.fix.heading import AttitudeAtPlace
-from starpos.fix.terms import ErrorTerm
+from starpos.fix.terms import ErrorTerm, total_covariance
 from starpos.units import ARCSEC
 
 # errors may be as large as this
@@ -106,9 +105,8 @@ def mean_attitude(attitudes: Sequence[AttitudeAtPlace]) -> MeanAttitude:
 def _mean(links: Sequence[Attitude], weight: np.ndarray) -> Attitude:
     """The mean of attitudes whose budgets name the same sources in the same order; the weights add up to 1."""
     mean = rotation.mean_rotation(np.array([link.rotation for link in links]), weight)
-    return link_attitude(
-        mean, tuple(_mean_term(terms, weight) for terms in zip(*(k.terms for k in links), strict=True))
-    )
+    terms = tuple(_mean_term(of_each, weight) for of_each in zip(*(k.terms for k in links), strict=True))
+    return replace(links[0], rotation=mean, covariance=total_covariance(terms)[3:, 3:], terms=terms)
 
 
 def _mean_term(terms: Sequence[ErrorTerm], weight: np.ndarray) -> ErrorTerm:

@@ -26,6 +26,7 @@ from starpos.fix.circle import Circle
 from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.sky.bodies import BODIES, ERFA, SolarSystem, body_at
 from starpos.sky.catalogue import Catalogue
+from starpos.tables import packaged
 from starpos.units import unix_of
 
 ARCMIN = math.radians(1 / 60)
@@ -232,6 +233,4 @@ def _star_row(sight: SextantSight, catalogue: Catalogue) -> np.ndarray:
 @lru_cache(maxsize=1)
 def star_names() -> dict[str, int]:
     """Hipparcos numbers of the Nautical Almanac's stars and Polaris, by their names."""
-    path = Path(__file__).parents[1] / "sky" / "data" / "navigation_stars.csv"
-    rows = csv.reader(path.read_text("utf-8").splitlines()[1:])
-    return {name: int(hip) for name, hip in rows}
+    return {row["name"]: int(row["hip"]) for row in packaged("starpos.sky", "navigation_stars.csv")}

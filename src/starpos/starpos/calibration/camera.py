@@ -33,7 +33,7 @@ from starpos.frames.frame import Stars
 from starpos.frozen import at_once
 from starpos.identification import Identification, PointingPrior, Sky, field_of, fisheye, identify, triangles
 from starpos.identification.triangles import TriangleCatalogue
-from starpos.instrument.camera import DECENTRED, EQUIDISTANT, Camera
+from starpos.instrument.camera import DECENTRED, EQUIDISTANT, Camera, pixels_over
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
@@ -115,7 +115,10 @@ class Intrinsics:
     @property
     def _grid(self) -> np.ndarray:
         """Pixels (G, 2) all over the frame; of a fisheye where it has shown stars."""
-        grid, middle = _grid(self.camera, BORDER), [self.camera.cx, self.camera.cy]
+        grid, middle = (
+            pixels_over(self.camera.width, self.camera.height, BORDER),
+            [self.camera.cx, self.camera.cy],
+        )
         if self.camera.model != EQUIDISTANT:
             return grid
         return grid[np.hypot(*(grid - middle).T) <= np.hypot(*(self.xy - middle).T).max()]
@@ -185,18 +188,12 @@ def check_sound(fitted: Intrinsics, given: Camera) -> None:
 def check_invertible(camera: Camera) -> None:
     """Raise CalibrationError if the distortion folds inside the frame."""
     try:
-        camera.directions(*_grid(camera, BORDER).T)
+        camera.directions(*pixels_over(camera.width, camera.height, BORDER).T)
     except InstrumentError:
         raise CalibrationError(
             "the distortion fitted to these stars folds inside the frame: give more frames, with stars in "
             "the corners"
         ) from None
-
-
-def _grid(camera: Camera, side: int) -> np.ndarray:
-    """Pixels (side^2, 2) on a regular grid over the frame, its corners included."""
-    x, y = np.meshgrid(np.linspace(0, camera.width - 1, side), np.linspace(0, camera.height - 1, side))
-    return np.stack([x.ravel(), y.ravel()], -1)
 
 
 def _derivatives(camera: Camera, xy: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -399,7 +396,7 @@ def seen_by(
 
     attitude (3, 3): east, north, up at the site into C.
     """
-    xy = _grid(camera, BORDER)
+    xy = pixels_over(camera.width, camera.height, BORDER)
     xy = xy[camera.sees(*xy.T)]
     local = camera.directions(*xy.T) @ attitude
     high = local[:, 2] > np.sin(SEEN_ABOVE_RAD)

@@ -14,7 +14,8 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
-from starpos.fix.star_fit import MatchedStars, distance2, judged
+from starpos.fix._scatter import distances2
+from starpos.fix.star_fit import MatchedStars, judged
 from starpos.frozen import at_once
 from starpos.instrument.camera import COEFFICIENTS, DECENTRED, EQUIDISTANT, PLUMB_BOB, RATIONAL, Camera
 
@@ -260,7 +261,7 @@ class CameraAdjustment:
 
     def cost(self, state: CameraEstimate, covariance: np.ndarray, keep: np.ndarray) -> float:
         """Chi-square of the stars to keep (N,) and of the priors; infinite if a star does not project."""
-        d2 = distance2(self.residual(state)[keep], covariance[keep])
+        d2 = distances2(self.residual(state)[keep], covariance[keep])
         total = d2.sum() + state.q @ state.q
         return float(total) if np.isfinite(total) else np.inf
 

@@ -23,24 +23,23 @@ from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
 from starpos.identification import Identification
 from starpos.identification.prior import Hint
-from starpos.instrument.inclinometer import InclinometerErrors, up_of
+from starpos.instrument.inclinometer import InclinometerErrors, angles_at, stated_variances
 from starpos.instrument.instrument import (
     OWN_LEVEL,
     SAG_ARCSEC_PER_SQRT_HOUR,
     UNKNOWN_ARCSEC,
+    VALID_DAYS,
     Calibration,
     CameraVertical,
     Instrument,
     level_errors,
 )
-from starpos.instrument.mounting import angles_at, stated_variances
 from starpos.instrument.tilt_log import Tilts, mean_known
 from starpos.progress import Progress, quiet
 from starpos.units import ARCSEC
 
 SOLVING_ROUNDS = 4
 SETTLED_RAD = 0.02 * ARCSEC
-VALID_DAYS = 365.0
 # factor on the sigma of A3's turn from the leans that the fixes use, because both come from the same tilts
 TURN_SIGMA = 3.0
 # frames further off are left out, up to this share of all, and so often are those left judged again
@@ -182,7 +181,7 @@ def calibrate(
         solved = [s.fix for s in solutions if s.fix]
         if len(solved) < fewest:
             break
-        a3 = solver.instrument.mounting.a3
+        a3 = solver.instrument.calibration.a3
         agreement = _agreed(find, solved, a3, errors)
         now = replace(_found(agreement), covariance_arcsec2=given.covariance_arcsec2)
         solver = _with(solver, now if inside else _unknown(agreement), agreement.errors)
@@ -400,7 +399,7 @@ def _unknown(agreement: _Agreement) -> Calibration:
     With an unknown turn every lean would become an error.
     """
     plumb, found = agreement.plumb, _found(agreement)
-    up = up_of(np.radians(found.tilt_deg))
+    up = found.up
     turn_arcsec = np.sqrt(up @ plumb.covariance @ up) / ARCSEC
     across, about = UNKNOWN_ARCSEC[0], min(UNKNOWN_ARCSEC[2], TURN_SIGMA * turn_arcsec)
     # the errors of single tilts would seem to determine the turn, unless the instrument really leans from pose to pose;

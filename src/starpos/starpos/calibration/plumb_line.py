@@ -16,9 +16,8 @@ from starpos.errors import FixError
 from starpos.fix.fix import Fix, zenith_variance
 from starpos.fix.terms import EACH_POSE
 from starpos.frozen import at_once
-from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.inclinometer import InclinometerErrors, response_columns, stated_variances
 from starpos.instrument.instrument import UNKNOWN_ARCSEC
-from starpos.instrument.mounting import response_columns, stated_variances
 from starpos.units import ARCSEC, MEDIAN_OF_CHI2
 
 # sigma of a coefficient that is as good as known

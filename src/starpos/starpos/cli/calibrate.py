@@ -448,7 +448,7 @@ def _level(stars: Stars, instrument: Instrument, tilts: TiltLog) -> np.ndarray |
             raise FrameError(f"no time of exposure: {why_no_time(stars)}")
         tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
         instrument.inclinometer.check_live(tilt)
-        return instrument.mounting.level(tilt).camera
+        return instrument.level(tilt).camera
     except StarposError as e:
         console.complain(f"{stars.source} is left out: {e}")
         return None

@@ -38,18 +38,18 @@ def run(args: argparse.Namespace) -> int:
     about = read.first(args.frames)
     if about is None:
         raise VoyageError(f"none of the {len(args.frames)} frames can be read: give star lists or frames")
-    instrument, axis = framed(options.instrument_of(args, about), about)
-    vessel, remark = under_way.vessel_of(
+    instrument, doubt = framed(options.instrument_of(args, about), about, under_way.MOUNT)
+    vessel = under_way.vessel_of(
         instrument,
         options.atmosphere_of(args),
-        axis,
+        doubt,
         mount_stddev_deg=args.mount_stddev,
         height_m=args.altitude_m,
         imu_model=args.imu_model,
         vehicle=args.vehicle,
         drift_stddev=args.drift_stddev,
     )
-    console.complain(remark)
+    console.complain(doubt)
     inputs.prepare(instrument, about)
     given = replace(inputs.given_of(args, about), instrument=instrument)
     work = partial(read.on, partial(under_way.voyage_frame, given))

@@ -15,7 +15,7 @@ from pathlib import Path
 import erfa
 import numpy as np
 
-from starpos.earth.ellipsoid import ECCENTRICITY2, EQUATOR_RADIUS_M
+from starpos.earth.ellipsoid import EQUATOR_RADIUS_M, ground_m
 from starpos.errors import TimeError
 from starpos.frozen import at_once
 from starpos.units import ARCSEC, DAY_S, UNIX_EPOCH_JD, utc_text
@@ -272,5 +272,5 @@ def later(itrs: np.ndarray, seconds: np.ndarray) -> np.ndarray:
 
 def station_velocity(zenith_itrs: np.ndarray) -> np.ndarray:
     """Velocity (3,) of the rotating ground in units of c, ITRS, at the place whose zenith is zenith_itrs (3,)."""
-    radius = EQUATOR_RADIUS_M / math.sqrt(1 - ECCENTRICITY2 * zenith_itrs[2] ** 2)
-    return ROTATION_RAD_S / SPEED_OF_LIGHT * radius * np.array([-zenith_itrs[1], zenith_itrs[0], 0.0])
+    x, y, _ = ground_m(zenith_itrs)
+    return ROTATION_RAD_S / SPEED_OF_LIGHT * np.array([-y, x, 0.0])

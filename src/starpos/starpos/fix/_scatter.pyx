@@ -27,15 +27,15 @@ cdef inline double distance2_of(
     return (yy * x * x - 2 * xy * x * y + xx * y * y) / determinant[0]
 
 
-def distances2(const double[:, ::1] residual, const double[:, :, ::1] covariance, double extra):
-    """Squared residuals (N,) of residual (N, 2) px in units of covariance (N, 2, 2) px2 plus an extra isotropic variance."""
+def distances2(const double[:, ::1] residual, const double[:, :, ::1] covariance):
+    """Squared residuals (N,) of residual (N, 2) px in units of covariance (N, 2, 2) px2."""
     cdef int k
     cdef double determinant
     fit(residual, covariance)
     out = np.empty(residual.shape[0])
     cdef double[::1] to = out
     for k in range(residual.shape[0]):
-        to[k] = distance2_of(residual, covariance, k, extra, &determinant)
+        to[k] = distance2_of(residual, covariance, k, 0.0, &determinant)
     return out
 
 
@@ -95,12 +95,15 @@ def sifted(
     const double[:, ::1] residual, const double[:, :, ::1] covariance, const unsigned char[::1] keep, double share,
     double median_of_chi2, double most2, double least, double good,
 ):
-    """The extra variance of those residuals that are kept (N,), and which of all (N,) go with them.
+    """The extra variance (px2) of those residuals that are kept (N,), and which of all (N,) go with them.
+
+    It is isotropic: under it the squared residuals (N, 2) px are as large as their covariance (N, 2, 2) px2 says; 0 if they
+    never are larger.
 
     share                  that part of the coordinates which a fit leaves free
     median_of_chi2, most2  of two degrees of freedom; and what squared residuals do not exceed that go with the others, under
                            the variance that the median asks for
-    least, good            of the search: see `extra_variance`
+    least, good            the least variance as a share of the most, and the share to which it is found
     """
     cdef int n = residual.shape[0], k
     cdef double determinant, extra, typical
@@ -119,25 +122,6 @@ def sifted(
     return extra, out
 
 
-def extra_variance(
-    const double[:, ::1] residual, const double[:, :, ::1] covariance, double share, double median_of_chi2, double least,
-    double good,
-):
-    """The isotropic variance (px2) at which squared residuals are as large as their covariance says; 0 if they never are larger.
-
-    residual, covariance  (N, 2) px, (N, 2, 2) px2
-    share                 that part of the coordinates which a fit leaves free
-    median_of_chi2        of two degrees of freedom: the median counts; 0: the mean
-    least, good           the least one as a share of the most, and the share to which it is found
-    """
-    cdef Columns all
-    cdef double *room = columns_of(residual, covariance, None, &all)
-    try:
-        return searched(&all, share, median_of_chi2, least, good)
-    finally:
-        free(room)
-
-
 cdef struct Columns:
     # n residuals, their squares and twice their product, their covariances, and room for as many distances
     int n
@@ -153,10 +137,10 @@ cdef struct Columns:
 cdef double *columns_of(
     const double[:, ::1] residual, const double[:, :, ::1] covariance, const unsigned char[::1] keep, Columns *c
 ) except NULL:
-    """Set c to the residuals that are kept (N,), or to all for None; what is returned holds its numbers."""
+    """Set c to the residuals that are kept (N,); what is returned holds its numbers."""
     cdef Py_ssize_t n = residual.shape[0], k
     fit(residual, covariance)
-    if keep is not None and keep.shape[0] != n:
+    if keep.shape[0] != n:
         raise ValueError(f"a mask of {keep.shape[0]} for {n} residuals")
     cdef double *room = <double *>malloc((7 * n + 1) * sizeof(double))
     if room == NULL:
@@ -166,7 +150,7 @@ cdef double *columns_of(
         room, room + n, room + 2 * n, room + 3 * n, room + 4 * n, room + 5 * n, room + 6 * n
     )
     for k in range(n):
-        if keep is None or keep[k]:
+        if keep[k]:
             c.x2[c.n], c.y2[c.n] = residual[k, 0] * residual[k, 0], residual[k, 1] * residual[k, 1]
             c.twice[c.n] = 2 * residual[k, 0] * residual[k, 1]
             c.xx[c.n], c.xy[c.n], c.yy[c.n] = covariance[k, 0, 0], covariance[k, 0, 1], covariance[k, 1, 1]
@@ -183,7 +167,7 @@ cdef int fit(const double[:, ::1] residual, const double[:, :, ::1] covariance) 
 
 
 cdef double searched(Columns *c, double share, double median_of_chi2, double least, double good) noexcept nogil:
-    """The extra variance, as `extra_variance` has it."""
+    """The extra variance as `sifted` has it; from the median if median_of_chi2 > 0, else from the mean."""
     cdef double here, there = 0.0, low, high = 1e-12, above, before, falls = 1.0
     cdef int turn, k
     if c.n == 0 or size(c, 0.0, median_of_chi2) <= share:

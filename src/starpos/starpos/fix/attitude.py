@@ -72,32 +72,28 @@ class Attitude:
     @cached_property
     def angles_covariance(self) -> np.ndarray:
         """Covariance (3, 3) in rad2 of heading, pitch, roll; unbounded where x is vertical."""
-        slope = self._slope
-        return slope @ self.covariance @ slope.T
-
-    @property
-    def _slope(self) -> np.ndarray:
-        """Change (3, 3) of heading, pitch, roll for small rotations about east, north, up."""
+        # change of each for small rotations about east, north, up
         east, north, _ = self.rotation[:, 0].tolist()
         level = max(math.hypot(east, north), 1e-6)
         pitch = np.array([north, -east, 0.0]) / level
         # about x itself by all of it, and up to the horizon by what the heading turns
         roll = np.array([east, north, 0.0]) / level**2
-        return np.array([heading_row(self.rotation), pitch, roll])
+        slope = np.array([heading_row(self.rotation), pitch, roll])
+        return slope @ self.covariance @ slope.T
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CameraAttitude:
     """Attitude of the camera at one time, by its stars alone, or by the Sun alone but for the turn about its direction.
 
-    utc_unix_s: middle of the exposure, None where it is not known; stamp_stddev_s, clock_stddev_s: of that stamp, and
-    of the clock that made it against UTC.  frame_id: the camera's, in a graph of nodes.
+    utc_unix_s: middle of the exposure; stamp_stddev_s, clock_stddev_s: of that stamp, and of the clock that made it
+    against UTC.  frame_id: the camera's, in a graph of nodes.
     camera_to_gcrs (3, 3): axes of the camera to the axes of GCRS, which are ICRS's, for directions without annual
     aberration but with refraction and diurnal aberration, which need a place.
     covariance (3, 3): rad2, of its small rotation about the camera's axes.  stars, log_odds: of the identification.
     """
 
-    utc_unix_s: float | None
+    utc_unix_s: float
     stamp_stddev_s: float
     clock_stddev_s: float
     frame_id: str

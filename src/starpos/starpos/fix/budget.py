@@ -17,8 +17,8 @@ from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.mounting import LocalLevel, Mounting
-from starpos.units import HOUR_S
+from starpos.instrument.instrument import Calibration, Instrument, LocalLevel
+from starpos.units import ARCSEC, HOUR_S
 
 # Name of the term of the calibrated A3.
 CALIBRATION = "calibration"
@@ -48,14 +48,14 @@ def local_north(a4: np.ndarray) -> LocalNorth:
 class Circumstances:
     """How a frame was taken: all that its fix takes besides what the frame and its level show.
 
-    mounting: of the camera, the level and the base link.  earth: when the row was exposed that is read first.
+    instrument: how camera, level and base link are mounted.  earth: when the row was exposed that is read first.
     clock_stddev_s, stamp_stddev_s: of the clock, and of the frame's time stamp by that clock.
     shutter: when each row was exposed.
     axis_stddev: error of the camera's optical axis, rad.
     """
 
     camera: Camera
-    mounting: Mounting
+    instrument: Instrument
     atmosphere: Atmosphere
     earth: EarthState
     clock_stddev_s: float
@@ -95,29 +95,29 @@ def link_attitude(link_to_enu: np.ndarray, terms: tuple[ErrorTerm, ...]) -> Atti
     return Attitude(link_to_enu, total_covariance(terms)[3:, 3:], of=LINK, into=ENU, terms=terms)
 
 
-def mount_term(name: str, link_to_enu: np.ndarray, stddev: float) -> tuple[ErrorTerm, ...]:
-    """The error of the base link against the sky that the camera sees, stddev rad about each axis; empty if that is 0."""
-    if not stddev:
+def mount_term(link_to_enu: np.ndarray, instrument: Instrument) -> tuple[ErrorTerm, ...]:
+    """The error of the base link against the sky that the camera sees; empty if it is 0."""
+    if not instrument.mount_stddev_arcsec:
         return ()
-    factor = np.vstack([np.zeros((2, 3)), heading_row(link_to_enu), np.eye(3)]) * stddev
-    return (ErrorTerm(name, factor, shared=ALWAYS),)
+    rows = np.vstack([np.zeros((2, 3)), heading_row(link_to_enu), np.eye(3)])
+    return (ErrorTerm("mount", rows * (instrument.mount_stddev_arcsec * ARCSEC), shared=ALWAYS),)
 
 
 def tilt_terms(
-    rows: np.ndarray, level: LocalLevel, tilt: Tilt, mounting: Mounting, utc_unix_s: float
+    rows: np.ndarray, level: LocalLevel, tilt: Tilt, instrument: Instrument, utc_unix_s: float
 ) -> tuple[ErrorTerm, ...]:
     """The terms of A3, then of the inclinometer; rows (n, 3): the factors' rows for a small rotation of L.
 
     None of them has Origin.OTHER: GNSS would count it twice.
     """
-    calibration, by_axes = np.empty((3, 4)), rows @ level.turns
-    np.matmul(level.a2, mounting.calibration_root, out=calibration[:, :3])
-    calibration[:, 3] = _turn_error(level, mounting)
+    c, calibration, by_axes = instrument.calibration, np.empty((3, 4)), rows @ level.turns
+    np.matmul(level.a2, c.covariance_root, out=calibration[:, :3])
+    calibration[:, 3] = _turn_error(level, c)
     of_a3 = partial(ErrorTerm, shared=ALWAYS, constant_within_pose=True, origin=Origin.A3)
     return (
         of_a3(CALIBRATION, rows @ calibration),
-        of_a3("remounting", rows @ level.a2 * mounting.remounted_rad),
-        *_inclinometer_terms(by_axes @ tilt.slope, tilt, mounting, utc_unix_s),
+        of_a3("remounting", rows @ level.a2 * (c.remounted_arcsec * ARCSEC)),
+        *_inclinometer_terms(by_axes @ tilt.slope, tilt, instrument, utc_unix_s),
         ErrorTerm(
             "tilt response",
             by_axes @ level.response,
@@ -155,30 +155,31 @@ def time_terms(
     return sky_terms(sky_rows(local_north(axes)), earth, clock_stddev_s, stamp_stddev_s, axes)
 
 
-def _turn_error(level: LocalLevel, mounting: Mounting) -> np.ndarray:
+def _turn_error(level: LocalLevel, c: Calibration) -> np.ndarray:
     """Second-order error (3,) of L, as a small rotation about its axes, from A3's error about the plumb line.
 
     The lean is the change of the tilt since the calibration. If A3 is off by an angle about the plumb line, the lean is
     turned by that angle. To first order this shifts it sideways, which the calibration's own covariance covers. To second
     order it shortens the lean by the angle's cosine: that part is here.
     """
-    then = mounting.calibrated_up
-    variance = then @ mounting.calibration_covariance @ then + mounting.remounted_rad**2
+    then = c.up
+    variance = then @ c.covariance @ then + (c.remounted_arcsec * ARCSEC) ** 2
     # the mean of (1 - cos)^2 over a Gaussian angle of this variance
     shorter2 = 1.5 - 2 * math.exp(-variance / 2) + math.exp(-2 * variance) / 2
     return level.turns @ (level.up - then) * math.sqrt(max(shorter2, 0.0))
 
 
 def _inclinometer_terms(
-    rows: np.ndarray, tilt: Tilt, mounting: Mounting, utc_unix_s: float
+    rows: np.ndarray, tilt: Tilt, instrument: Instrument, utc_unix_s: float
 ) -> tuple[ErrorTerm, ...]:
     """The inclinometer's terms; rows (n, axes): an ErrorTerm's rows for an error of each angle.
 
     Its zero is not among them: the calibration's covariance includes it.
     """
-    errors, term = mounting.inclinometer, partial(ErrorTerm, origin=Origin.INCLINOMETER)
-    since_s = abs(utc_unix_s - mounting.calibrated_unix_s)
-    warmer_c = mounting.warmer_c(tilt)
+    errors, c = instrument.inclinometer, instrument.calibration
+    term = partial(ErrorTerm, origin=Origin.INCLINOMETER)
+    since_s = abs(utc_unix_s - c.utc_unix_s)
+    warmer_c = c.warmer_c(tilt)
     return (
         ErrorTerm("tilt", rows @ symmetric_root(tilt.noise), shared=tilt.times, origin=Origin.READINGS),
         term("tilt quantisation", rows * errors.undithered_rad(tilt), shared=errors.steps(tilt)),
@@ -193,9 +194,7 @@ def _inclinometer_terms(
         ),
         term(
             "tilt temperature",
-            rows
-            * errors.temperature_rad_per_c
-            * (warmer_c if math.isfinite(warmer_c) else mounting.unmeasured_c),
+            rows * errors.temperature_rad_per_c * (warmer_c if math.isfinite(warmer_c) else c.unmeasured_c),
             shared=ALWAYS,
         ),
     )

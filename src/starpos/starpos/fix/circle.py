@@ -62,8 +62,8 @@ def circle_along(
 
     place: the frame's name, for messages.
     """
-    mounting, atmosphere, earth = about.mounting, about.atmosphere, about.earth
-    level = mounting.level(tilt)
+    instrument, atmosphere, earth = about.instrument, about.atmosphere, about.earth
+    level = instrument.level(tilt)
     seen = level.camera @ ray
     sine = np.hypot(seen[0], seen[1])
     if sine < MIN_SINE or seen[2] < MIN_COS_ZENITH:
@@ -73,7 +73,7 @@ def circle_along(
         )
     # up that errs by a small rotation of L lies nearer to the axis, or further
     rows = np.array([[-seen[1], seen[0], 0.0]]) / sine
-    terms = tilt_terms(rows, level, tilt, mounting, earth.utc_unix_s)
+    terms = tilt_terms(rows, level, tilt, instrument, earth.utc_unix_s)
     true = atmosphere.refraction().unbend(seen)
     z = float(np.arctan2(np.hypot(true[0], true[1]), true[2]))
     bent = (z - np.arctan2(sine, seen[2])) * atmosphere.relative_sigma

@@ -5,7 +5,7 @@ covariance.
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +15,7 @@ from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m, enu_axes
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
-from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of
+from starpos.fix.attitude import Attitude, heading_of
 from starpos.fix.budget import (
     Circumstances,
     level_rows,
@@ -26,14 +26,14 @@ from starpos.fix.budget import (
     sky_terms,
     tilt_terms,
 )
-from starpos.fix.sighting import FittedSighting, fitted_fields
+from starpos.fix.sighting import FittedSighting, fitted_fields, seen_fields
 from starpos.fix.star_fit import MatchedStars, apparent, fit_stars
 from starpos.fix.terms import EACH_POSE, ErrorTerm, Origin, total_covariance
 from starpos.frames.tables import Pointing
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.mounting import LocalLevel
+from starpos.instrument.instrument import LocalLevel
 from starpos.units import ARCSEC
 
 # lengths from here on are given in km
@@ -207,25 +207,25 @@ def levelled_fix(
     level: LocalLevel,
     tilt: Tilt,
     about: Circumstances,
-    terms_of: Callable[[np.ndarray], Iterable[ErrorTerm]],
+    terms_of: Callable[[np.ndarray], tuple[Iterable[ErrorTerm], Iterable[ErrorTerm]]],
 ) -> Fix:
     """The fix by a level and A4 (3, 3), ITRS into the level's axes L; seen: the fields that say what the frame shows.
 
-    terms_of: the terms of what is seen, by the factors' rows (6, 3) for a small rotation of the sky about L's axes.
+    terms_of: the terms of what is seen, by the factors' rows (6, 3) for a small rotation of the sky about L's axes; those
+    that a budget has before the level's terms, and those after them.
     """
-    mounting, place = about.mounting, local_north(a4)
-    link_to_enu = place.local_to_enu @ level.camera @ mounting.link_to_camera
+    instrument, place = about.instrument, local_north(a4)
+    link_to_enu = place.local_to_enu @ level.camera @ instrument.link_to_camera
     of_sky, of_level = sky_rows(place), level_rows(place, link_to_enu)
     # the two axes go with the inclinometer, however it leans
     axes = rotation.shortest_turn(np.array([0.0, 0.0, 1.0]), level.up)[:, :2]
-    own, other, *rest = terms_of(of_sky)
+    before, after = terms_of(of_sky)
     terms = (
-        own,
-        other,
-        *tilt_terms(of_level, level, tilt, mounting, about.earth.utc_unix_s),
-        *rest,
+        *before,
+        *tilt_terms(of_level, level, tilt, instrument, about.earth.utc_unix_s),
+        *after,
         *sky_terms(of_sky, about.earth, about.clock_stddev_s, about.stamp_stddev_s, a4),
-        *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
+        *mount_term(link_to_enu, instrument),
     )
     return Fix(
         **seen,
@@ -241,15 +241,15 @@ def levelled_fix(
 
 def solve_fix(stars: MatchedStars, tilt: Tilt, about: Circumstances) -> Fix:
     """The fix of one frame from identified stars; FixError if the stars are too few or do not agree."""
-    level = about.mounting.level(tilt)
+    level, stddev = about.instrument.level(tilt), about.instrument.lens_stddev_rad
     g = level.camera
     seen = fit_stars(stars, about.camera, g, about.atmosphere.refraction(), apparent(stars, about))
 
-    def terms_of(rows: np.ndarray) -> tuple[ErrorTerm, ...]:
-        if not (stddev := about.mounting.lens_stddev_rad):
-            return seen.terms(rows, about)
+    def terms_of(rows: np.ndarray) -> tuple[Iterable[ErrorTerm], Iterable[ErrorTerm]]:
+        centroids, catalogue, *rest = seen.terms(rows, about)
         # what is not known of the lens moves directions in C, newly at each pose
-        return *seen.terms(rows, about), ErrorTerm("lens", rows @ g[:, :2] * stddev, shared=EACH_POSE)
+        lens = [ErrorTerm("lens", rows @ g[:, :2] * stddev, shared=EACH_POSE)] if stddev else []
+        return (centroids, catalogue), (*rest, *lens)
 
     a4 = seen.fit.a4
     return levelled_fix(fitted_fields(seen, about, g, a4), a4, level, tilt, about, terms_of)
@@ -258,8 +258,6 @@ def solve_fix(stars: MatchedStars, tilt: Tilt, about: Circumstances) -> Fix:
 # the camera that sees the stars, in place of an unknown one: only its axes count
 IDEAL = Camera.from_focal(201, 201, 10_000.0)
 RING_STARS, RING_PX = 6, 40.0
-# the terms of the errors of stars, which the pointing's error replaces
-OF_STARS = ("centroids", "catalogue")
 
 
 def frame_axes(camera: Camera) -> np.ndarray:
@@ -272,9 +270,8 @@ def frame_axes(camera: Camera) -> np.ndarray:
 
 def pointing_fix(pointing: Pointing, tilt: Tilt, about: Circumstances) -> Fix:
     """The fix of a frame whose pointing and roll are known; FixError if it cannot be."""
-    mounting = about.mounting
-    to_frame = frame_axes(about.camera)
-    seen = replace(mounting, a3=mounting.a3 @ to_frame.T, link_to_camera=to_frame @ mounting.link_to_camera)
+    level = about.instrument.level(tilt)
+    to_level = level.camera @ frame_axes(about.camera).T
     angle = 2 * np.pi * np.arange(RING_STARS) / RING_STARS
     xy = np.array(IDEAL.centre_px) + RING_PX * np.stack([np.cos(angle), np.sin(angle)], -1)
     # so large that refraction's and aberration's effect on the ring's shape is negligible
@@ -285,23 +282,20 @@ def pointing_fix(pointing: Pointing, tilt: Tilt, about: Circumstances) -> Fix:
         IDEAL.directions(*xy.T) @ _frame_to_icrs(pointing).T,
         np.zeros(RING_STARS),
     )
-    fix = solve_fix(stars, tilt, replace(about, camera=IDEAL, mounting=seen))
-    g, to_itrs = seen.level(tilt).camera, fix.camera.rotation
+    seen = fit_stars(stars, IDEAL, to_level, about.atmosphere.refraction(), apparent(stars, about))
     # the centre's error turns the frame about two axes across its own, the roll's error about its own axis
     own = np.diag([pointing.sigma, pointing.sigma, pointing.sigma_roll]) ** 2
-    rows = sky_rows(local_north(g @ to_itrs.T))
-    return replace(
-        fix,
-        terms=(
-            ErrorTerm("pointing", rows @ symmetric_root(g @ own @ g.T)),
-            *(t for t in fix.terms if t.name not in OF_STARS),
-        ),
-        used=np.zeros(0, int),
-        residual_px=np.zeros((0, 2)),
-        residual_arcsec=float("nan"),
-        jitter_px=0.0,
-        camera=Attitude(to_itrs @ to_frame, to_itrs @ own @ to_itrs.T, of=CAMERA, into=ITRS),
-    )
+    own = to_level @ own @ to_level.T
+
+    def terms_of(rows: np.ndarray) -> tuple[Iterable[ErrorTerm], Iterable[ErrorTerm]]:
+        # the pointing's error replaces the errors of the ring's stars
+        _, _, *rest = seen.terms(rows, about)
+        return (ErrorTerm("pointing", rows @ symmetric_root(own)),), rest
+
+    a4 = seen.fit.a4
+    fields = seen_fields(about, level.camera, a4, own)
+    fields |= {"residual_arcsec": math.nan, "focal_scale": seen.fit.scale}
+    return levelled_fix(fields, a4, level, tilt, about, terms_of)
 
 
 def _frame_to_icrs(pointing: Pointing) -> np.ndarray:

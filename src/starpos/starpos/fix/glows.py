@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos import rotation
 from starpos.frozen import at_once
+from starpos.rotation import angle
 
 # Minimum way of the Sun, and maximum way of a glow that stands still, in sigma of two glows; minimum share of the Sun's
 # way by which a glow moves.
@@ -32,15 +32,11 @@ class Glow:
 
     def stood_still(self, later: "Glow") -> bool | None:
         """Whether the spot has kept its place in the camera while the Sun moved; None while either is too little."""
-        went, moved = _angle(self.itrs, later.itrs), _angle(self.ray, later.ray)
+        went, moved = angle(self.itrs, later.itrs), angle(self.ray, later.ray)
         sigma = math.hypot(self.sigma, later.sigma)
         if went < MOVED_SIGMAS * sigma or STILL_SIGMAS * sigma < moved < STILL * went:
             return None
-        return moved < STILL * went
-
-
-def _angle(a: np.ndarray, b: np.ndarray) -> float:
-    return math.atan2(float(np.linalg.norm(rotation.cross(a, b))), float(a @ b))
+        return bool(moved < STILL * went)
 
 
 class Glows:

@@ -23,7 +23,7 @@ from starpos.fix.star_fit import MatchedStars, StarFit, adjustment_of, apparent,
 from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
 from starpos.frozen import at_once
 from starpos.identification import fisheye
-from starpos.instrument.mounting import Mounting
+from starpos.instrument.instrument import Instrument
 
 # the level settles to this, rad; refraction turns with it, and settles a thousand times faster, or ten times at 10 deg
 SETTLED_RAD, MAX_ROUNDS = 1e-9, 10
@@ -80,7 +80,7 @@ class AttitudeAtPlace(FittedSighting):
 def attitude_at_place(stars: MatchedStars, place: Place, about: Circumstances) -> AttitudeAtPlace:
     """Heading, pitch and roll of the base link from identified stars at a known place.
 
-    about: of its mounting only the base link on the camera is used.
+    about: of its instrument only the base link on the camera is used.
     Raises FixError if the stars are too few or do not agree, PlaceError if they are below the horizon of this place.
     """
     camera, atmosphere = about.camera, about.atmosphere
@@ -119,7 +119,7 @@ def attitude_at_place(stars: MatchedStars, place: Place, about: Circumstances) -
     deflected = moved * place.plumb_stddev, moved * place.ellipsoid_stddev
     return AttitudeAtPlace(
         **fitted_fields(seen, about, g, a4),
-        **attitudes_at(place, g, about.mounting, terms, deflected),
+        **attitudes_at(place, g, about.instrument, terms, deflected),
         place=place,
         hour_shown=shown,
     )
@@ -128,7 +128,7 @@ def attitude_at_place(stars: MatchedStars, place: Place, about: Circumstances) -
 def attitudes_at(
     place: Place,
     g: np.ndarray,
-    mounting: Mounting,
+    instrument: Instrument,
     terms: Iterable[ErrorTerm],
     deflected: tuple[np.ndarray, np.ndarray],
 ) -> dict[str, Any]:
@@ -137,7 +137,7 @@ def attitudes_at(
     g (3, 3): C into east, north, up by the plumb line.  terms: their factors are rotations (3, m) about these.
     deflected: rotations (3, m) by 1 sigma of the deflection, by the plumb line and by the ellipsoid.
     """
-    link = g @ mounting.link_to_camera
+    link = g @ instrument.link_to_camera
     plumb, ellipsoid = deflected
 
     def attitude(link_to_enu: np.ndarray, deflection: np.ndarray) -> Attitude:
@@ -151,7 +151,7 @@ def attitudes_at(
             (
                 *map(whole, terms),
                 whole(ErrorTerm("deflection", deflection, shared=ALWAYS)),
-                *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
+                *mount_term(link_to_enu, instrument),
             ),
         )
 

@@ -71,11 +71,6 @@ class Question:
     until_s: float = NEVER_S
     known: Identification | None = None
 
-    @property
-    def is_late(self) -> bool:
-        """Whether no further way may be begun."""
-        return time.monotonic() >= self.until_s
-
 
 @at_once
 @dataclass(frozen=True, eq=False)
@@ -167,7 +162,7 @@ def _solved(solver: Solver, q: Question, tilts: Tilts) -> Sight:
 
 def _otherwise(solver: Solver, q: Question, first: Sight) -> Sight:
     """The sight of a frame by all ways but the search among its stars, which has given `first`."""
-    return _another(q.item, first, lambda seen: _ways(solver, q, seen), lambda: q.is_late)
+    return _another(q.item, first, lambda seen: _ways(solver, q, seen), lambda: time.monotonic() >= q.until_s)
 
 
 def _ways(solver: Solver, q: Question, seen: Stars) -> Iterator[Solution]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solution of a frame: its status, the part of the answer that was found, and what is suspicious about it."""
+"""The solution of a frame: its status, what was found, planets among its stars, and what is suspicious about it."""
 
 import math
 import time
@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from starpos.earth.orientation import earth_state
 from starpos.errors import FixError, PlaceError, StarposError, TiltError, TiltRangeError, TimeError
 from starpos.fix.circle import Circle
 from starpos.fix.fix import Fix
 from starpos.fix.glows import Glow, Glows
 from starpos.fix.heading import AttitudeAtPlace
-from starpos.fix.planets import planets_among
 from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
 from starpos.frozen import at_once
@@ -25,6 +25,7 @@ from starpos.identification.prior import Hint
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import Tilt
+from starpos.sky.bodies import body_at
 from starpos.sky.catalogue import NamedStars, named_stars
 from starpos.units import ARCSEC, utc_text
 
@@ -269,6 +270,39 @@ def solution_of(
         found=found,
         identify_s=time.perf_counter() - begin_s,
     )
+
+
+# of a planet from its predicted place: px, and sigma of the ephemeris
+NEAR_PX, NEAR_SIGMAS = 6.0, 3.0
+# Planets that outshine most stars, and the number of a frame's brightest detections that are looked at.
+BRIGHTEST = 12
+BRIGHT = "mercury", "venus", "mars", "jupiter", "saturn"
+
+
+def planets_among(stars: Stars, found: Identification, camera: Camera) -> tuple[tuple[str, int], ...]:
+    """Names of planets on a frame and the rows of `stars` that they are; () without a time, and for a mirrored frame."""
+    if stars.mid_unix_s is None or found.mirrored:
+        return ()
+    known = set(found.star[:BRIGHTEST].tolist())
+    others = np.array([row for row in range(min(len(stars), BRIGHTEST)) if row not in known])
+    if not len(others):
+        return ()
+    seen = camera.scaled(found.focal_scale)
+    try:
+        state = earth_state(stars.mid_unix_s)
+        rays = seen.directions(stars.x[others], stars.y[others])
+    except StarposError:
+        return ()
+    # rays are compared, not pixels: distortion's formula has no place for a planet far outside the frame
+    sky = rays @ found.attitude @ state.gcrs_to_itrs.T
+    named = []
+    for name in BRIGHT:
+        body = body_at(name, state)
+        off = np.linalg.norm(sky - body.itrs, axis=1)
+        near = int(np.argmin(off))
+        if off[near] < NEAR_PX / seen.fx + NEAR_SIGMAS * body.sigma + body.radius:
+            named.append((name, int(others[near])))
+    return tuple(named)
 
 
 def suspicions(

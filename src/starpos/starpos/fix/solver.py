@@ -204,7 +204,7 @@ class Solver:
                 return self.solve(stars.select(rows), tilts, hint, predicted, known).among(stars, rows)
             state, tilt = self.levelled(stars, tilts)
             camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
-            g = self.instrument.mounting.level(tilt).camera
+            g = self.instrument.level(tilt).camera
             begin = time.perf_counter()
             directions = self.atmosphere.refraction().unbend(directions_of(camera, stars) @ g.T) @ g
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
@@ -286,14 +286,14 @@ class Solver:
         seen = np.array([[0.0, 0.0, 1.0]])
         if isinstance(frame, Stars) and len(frame.x):
             seen = directions_of(self.view(frame.width, frame.height, frame.origin_px)[0], frame)
-        sine = float(seen.mean(0) @ self.instrument.mounting.a3.T @ tilt.up)
+        sine = float(seen.mean(0) @ self.instrument.calibration.a3.T @ tilt.up)
         if self.instrument.calibration.unknown or abs(sine) < MIN_TOLD_SINE:
             raise TiltError(EITHER_WAY)
         return replace(tilt if sine > 0 else tilt.reversed, either_way=False)
 
     def _fix(self, stars: Stars, found: Identification, tilt: Tilt, state: EarthState) -> Fix:
         camera, _, _ = self.view(stars.width, stars.height, stars.origin_px)
-        up = self.instrument.mounting.level(tilt).camera[2]
+        up = self.instrument.level(tilt).camera[2]
         use, matched = self._matched(stars, found, up, state)
         if fisheye.is_wide(camera):
             detected = directions_of(camera, stars) @ up
@@ -365,7 +365,7 @@ class Solver:
         """How a frame was taken, by a camera in its pixels, at a state of the Earth."""
         return Circumstances(
             camera=camera,
-            mounting=self.instrument.mounting,
+            instrument=self.instrument,
             atmosphere=self.atmosphere,
             earth=earth,
             clock_stddev_s=self.clock_stddev_s(frame),
@@ -396,17 +396,8 @@ class Solver:
         origin_px: column and row of the camera's whole frame at which they begin, as their Exposure has it.
         """
         key = width, height, origin_px
-        if key not in self._views:
-            camera, catalogue = self._field(width, height, origin_px)
-            triangles = cached_triangles(catalogue, fisheye.field_rad(camera), self.progress)
-            # one size is usual
-            self._views.clear()
-            self._views[key] = camera, catalogue, triangles
-        return self._views[key]
-
-    def _field(
-        self, width: int, height: int, origin_px: tuple[float, float] | None
-    ) -> tuple[Camera, Catalogue]:
+        if key in self._views:
+            return self._views[key]
         camera = self.instrument.camera_for(width, height, origin_px)
         field_deg = math.degrees(2 * camera.half_diagonal_rad)
         if field_deg < SMALLEST_FIELD_DEG or (field_deg > LARGEST_FIELD_DEG and not fisheye.is_wide(camera)):
@@ -415,7 +406,12 @@ class Solver:
                 f"from {SMALLEST_FIELD_DEG:g} to {LARGEST_FIELD_DEG:g} deg: check focal length and pixel size, and "
                 "whether the lens is a fisheye (equidistant)"
             )
-        return camera, deeper.for_field(self.catalogue, camera)
+        catalogue = deeper.for_field(self.catalogue, camera)
+        triangles = cached_triangles(catalogue, fisheye.field_rad(camera), self.progress)
+        # one size is usual
+        self._views.clear()
+        self._views[key] = camera, catalogue, triangles
+        return self._views[key]
 
 
 def _refracted(

@@ -15,7 +15,7 @@ from starpos.earth.orientation import EQUATOR_M_PER_S, ROTATION_RAD_S, SPEED_OF_
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere, Refraction
 from starpos.errors import FixError
 from starpos.fix._adjustment import Adjustment, gain_of, spread
-from starpos.fix._scatter import distances2, expected_variance, sifted
+from starpos.fix._scatter import expected_variance, sifted
 from starpos.fix.budget import Circumstances
 from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.exposure import Shutter
@@ -152,11 +152,6 @@ def expected_extra(residual: np.ndarray, covariance: np.ndarray, share: float) -
     stated = float(traces[(len(traces) - 1) // 2] + traces[len(traces) // 2]) / 4
     most = GRID_MOST * max(stated, float(np.vdot(residual, residual)))
     return expected_variance(residual, covariance, share, stated, GRID_LEAST * stated, most)
-
-
-def distance2(residual: np.ndarray, covariance: np.ndarray, extra: float = 0.0) -> np.ndarray:
-    """Squared residuals (N,) in units of their covariance plus an extra isotropic variance (px2)."""
-    return distances2(np.ascontiguousarray(residual, float), np.ascontiguousarray(covariance, float), extra)
 
 
 # maximum scatter as a share of the frame's diagonal; stars that scatter more were misidentified

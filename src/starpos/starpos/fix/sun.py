@@ -315,11 +315,6 @@ class _Between:
         seen, true = (2 * math.asin(math.dist(*v) / 2) for v in (self.there, self.sky))
         return seen, true
 
-    @property
-    def agree(self) -> bool:
-        """Whether these two angles are the same, to their error."""
-        return abs(self.angles[0] - self.angles[1]) < SECOND_SIGMAS * self.sigma
-
 
 def _with_planet(
     shot: _Shot, disc: Disc, tilt: Tilt, place: Place | None
@@ -334,7 +329,7 @@ def _with_planet(
         Disc(x=x, y=y, covariance=covariance, radius_px=0.0, sharp=True)
         for x, y, covariance, _ in zip(stars.x, stars.y, stars.covariance, range(POINTS), strict=False)
     ]
-    level = about.mounting.level(tilt)
+    level = about.instrument.level(tilt)
     pixels = (np.arange(GRID) + 0.5) / GRID
     x, y = (part.ravel() for part in np.meshgrid(pixels * stars.width, pixels * stars.height))
     rays = about.camera.directions(x, y)
@@ -348,7 +343,7 @@ def _with_planet(
             off, sigma = np.array([seen - true]), np.array([pair.sigma])
             if place is not None:
                 planet = _Above.of(looks[1], level.camera, place)
-                of_level = tilt_terms(planet.turn[1:], level, tilt, about.mounting, about.earth.utc_unix_s)
+                of_level = tilt_terms(planet.turn[1:], level, tilt, about.instrument, about.earth.utc_unix_s)
                 variance = total_covariance(planet.terms)[1, 1] + total_covariance(of_level)[0, 0]
                 altitude = math.asin(planet.bent[2])
                 off = np.append(off, math.asin(pair.raised[1, 2]) - altitude)
@@ -364,15 +359,16 @@ def _with_planet(
 def _two_body_fix(looks: list[_Look], tilt: Tilt) -> Fix:
     """Place and attitude by two bodies and the level; PlaceError if they are not as far apart as they must be."""
     shot = looks[0].shot
-    about, level = shot.about, shot.about.mounting.level(tilt)
+    about, level = shot.about, shot.about.instrument.level(tilt)
     g = level.camera
     pair = _Between.of(looks, g)
     raised, there, variances, a4 = pair.raised, pair.there, pair.variances, pair.a4
-    if not pair.agree:
-        seen_deg, true_deg = np.degrees(pair.angles)
+    seen, true = pair.angles
+    if not abs(seen - true) < SECOND_SIGMAS * pair.sigma:
         names = _named(tuple(k.body.name for k in looks))
         raise PlaceError(
-            f"{shot.stars.place}: its two bright discs are {seen_deg:.2f} deg apart, and {names} {true_deg:.2f}"
+            f"{shot.stars.place}: its two bright discs are {math.degrees(seen):.2f} deg apart, and {names} "
+            f"{math.degrees(true):.2f}"
         )
     across = axes_across(there)
     turned = [np.cross(v, c) for v, c in zip(there, across, strict=True)]
@@ -383,6 +379,11 @@ def _two_body_fix(looks: list[_Look], tilt: Tilt) -> Fix:
         for k, c, v, seen in zip(looks, across, there, raised, strict=True)
     ]
     own = total_covariance(_of_all(by, [terms[:1] for terms in of_bodies]))
+
+    def terms_of(rows: np.ndarray) -> tuple[list[ErrorTerm], list[ErrorTerm]]:
+        terms = _of_all([rows @ row for row in by], of_bodies)
+        return terms[:2], terms[2:]
+
     fix = levelled_fix(
         seen_fields(about, g, a4, own)
         | {"residual_arcsec": math.sqrt(float(np.mean((there - pair.sky @ a4.T) ** 2))) / ARCSEC},
@@ -390,7 +391,7 @@ def _two_body_fix(looks: list[_Look], tilt: Tilt) -> Fix:
         level,
         tilt,
         about,
-        lambda rows: _of_all([rows @ row for row in by], of_bodies),
+        terms_of,
     )
     check_unmoved(fix, shot.solver.instrument)
     return fix
@@ -399,7 +400,7 @@ def _two_body_fix(looks: list[_Look], tilt: Tilt) -> Fix:
 def _on_circle(as_sun: _Look, tilt: Tilt) -> Solution:
     """The Sun's circle of equal altitude, with the Moon's in its stead; a glow is not the Moon's."""
     shot, ray, disc = as_sun.shot, as_sun.ray, as_sun.disc
-    up = shot.about.mounting.level(tilt).camera[2]
+    up = shot.about.instrument.level(tilt).camera[2]
     across = (up - (up @ ray) * ray) / max(math.sqrt(1 - (up @ ray) ** 2), MIN_SINE)
     lens = ErrorTerm("lens", (across @ as_sun.lens)[None], shared=ALWAYS)
 
@@ -427,15 +428,15 @@ OF_UP = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 def _attitude(looks: list[_Look], tilt: Tilt, place: Place) -> AttitudeAtPlace:
     """The attitude by directions of bodies and the level, each in two components; PlaceError if they contradict."""
     about, frame = looks[0].shot.about, looks[0].shot.stars.place
-    mounting = about.mounting
-    level, moved = mounting.level(tilt), zenith_moved(place.plumb[0])
+    instrument = about.instrument
+    level, moved = instrument.level(tilt), zenith_moved(place.plumb[0])
     first, local = _Above.of(looks[0], level.camera, place), level.camera @ looks[0].ray
     if min(math.hypot(*first.bent[:2]), math.hypot(*local[:2])) < MIN_SINE:
         raise FixError(
             f"{frame}: the {looks[0].body.name.title()} is in the zenith, where it gives no heading"
         )
     found = g = first.g
-    of_up = tilt_terms(OF_UP @ g @ level.camera.T, level, tilt, mounting, about.earth.utc_unix_s)
+    of_up = tilt_terms(OF_UP @ g @ level.camera.T, level, tilt, instrument, about.earth.utc_unix_s)
     up = OF_UP.T @ np.linalg.inv(total_covariance(of_up))
     normal = up @ OF_UP
     weighted: list[np.ndarray] = []
@@ -473,7 +474,7 @@ def _attitude(looks: list[_Look], tilt: Tilt, place: Place) -> AttitudeAtPlace:
         **seen_fields(about, found, place.plumb_axes, own) | {"residual_px": np.array(off_px)},
         residual_arcsec=math.dist(expected, looks[-1].ray) / ARCSEC,
         place=place,
-        **attitudes_at(place, found, mounting, terms, (plumb, ellipsoid)),
+        **attitudes_at(place, found, instrument, terms, (plumb, ellipsoid)),
     )
 
 

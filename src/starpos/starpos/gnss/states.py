@@ -19,9 +19,14 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
 from starpos.errors import GnssError
 from starpos.fix.fix import Fix
-from starpos.instrument.inclinometer import UNMEASURED_WALK_C_PER_SQRT_HOUR, Tilt
+from starpos.instrument.inclinometer import (
+    RESPONSE_COEFFICIENTS,
+    UNMEASURED_WALK_C_PER_SQRT_HOUR,
+    Tilt,
+    response_columns,
+    stated_variances,
+)
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, response_columns, stated_variances
 from starpos.units import ARCSEC
 
 # Share of the deflection's variance that is the same everywhere the instrument goes; the rest is a field.
@@ -149,16 +154,15 @@ class Learned:
 
 def prior(instrument: Instrument, tilt: Tilt, deflection_stddev_rad: float, utc_unix_s: float) -> Learned:
     """What is known of an instrument before GNSS has taught anything, at the time of a tilt."""
-    mounting, errors = instrument.mounting, instrument.inclinometer
-    at, calibration = layout_of(tilt.axes), instrument.calibration
+    at, calibration, errors = layout_of(tilt.axes), instrument.calibration, instrument.inclinometer
     variance = np.zeros((at.size, at.size))
     variance[at.a3, at.a3] = (
-        np.eye(3) * NO_A3_RAD**2 if calibration.unknown else mounting.calibration_covariance
-    ) + np.eye(3) * mounting.remounted_rad**2
+        np.eye(3) * NO_A3_RAD**2 if calibration.unknown else calibration.covariance
+    ) + np.eye(3) * (calibration.remounted_arcsec * ARCSEC) ** 2
     since_s = abs(utc_unix_s - calibration.utc_unix_s)
-    drift2, warmer_c = errors.wander_variance(since_s), mounting.warmer_c(tilt)
+    drift2, warmer_c = errors.wander_variance(since_s), calibration.warmer_c(tilt)
     if not np.isfinite(warmer_c):
-        drift2 += (errors.temperature_rad_per_c * mounting.unmeasured_c) ** 2
+        drift2 += (errors.temperature_rad_per_c * calibration.unmeasured_c) ** 2
     state = np.zeros(at.size)
     if calibration.response and len(calibration.response) == RESPONSE_COEFFICIENTS[tilt.axes]:
         state[at.response] = calibration.response
@@ -177,8 +181,8 @@ def prior(instrument: Instrument, tilt: Tilt, deflection_stddev_rad: float, utc_
         variance[rows, rows] = np.eye(rows.stop - rows.start) * value
     return Learned(
         axes=tilt.axes,
-        a3=mounting.a3,
-        calibrated_up=mounting.calibrated_up,
+        a3=calibration.a3,
+        calibrated_up=calibration.up,
         temperature_c=calibration.temperature_c if np.isfinite(warmer_c) else tilt.temperature_c,
         warmer_c=warmer_c if np.isfinite(warmer_c) else 0.0,
         state=state,

@@ -68,6 +68,12 @@ def check_axis(width: int, height: int, cx: float, cy: float, place: str) -> Non
         )
 
 
+def pixels_over(width: int, height: int, side: int) -> np.ndarray:
+    """Pixels (side^2, 2) on a regular grid over a frame, its corners included."""
+    x, y = np.meshgrid(np.linspace(0, width - 1, side), np.linspace(0, height - 1, side))
+    return np.stack([x.ravel(), y.ravel()], -1)
+
+
 @lru_cache(maxsize=64)
 def _reach(d: tuple[float, ...]) -> float:
     """The angle off the axis, rad, out to which a fisheye has a picture; at most pi."""

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inclinometer: its readings, its errors, and A2, which takes its frame S into the local level L."""
+"""The inclinometer: its readings, its errors, its response, and A2, which takes its frame S into the local level L."""
 
 import math
 from dataclasses import KW_ONLY, dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import combinations
 
 import numpy as np
 
@@ -333,3 +334,51 @@ def level_of(up: np.ndarray) -> np.ndarray:
     cb, sb = np.sqrt(up[1] ** 2 + up[2] ** 2), -up[0]
     sa, ca = up[1] / cb, up[2] / cb
     return np.array([[cb, sa * sb, ca * sb], [0.0, ca, -sa], [-sb, sa * cb, ca * cb]])
+
+
+# The response: how the angles err at another lean than at the calibration. Each axis has a zero and a scale, each pair of
+# axes an angle that is not square. A3 is fitted at the calibration's lean, so these count only away from it; even a zero
+# does, because a constant error of an angle is not a rotation. Number of coefficients by number of axes.
+RESPONSE_COEFFICIENTS = {2: 5, 3: 9}
+
+
+def angles_at(up: np.ndarray, axes: int) -> np.ndarray:
+    """The elevations (axes,) in rad of S's axes for up (3,) in S."""
+    return np.arcsin(np.clip(up, -1, 1))[:axes]
+
+
+@lru_cache(maxsize=8)
+def _zeroed(up: tuple[float, ...], axes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Angles (axes,) of a lean, and the rotation of S (axes, 3) that moves up there as an error of each angle does."""
+    there = np.array(up)
+    theta = angles_at(there, axes)
+    return theta, rotation.cross(there, up_slope(theta, there).T)
+
+
+def response_columns(theta: np.ndarray, up: np.ndarray, calibrated_up: np.ndarray) -> np.ndarray:
+    """Change (3, m) of up (3,) in S, as read at the angles theta (axes,), for each coefficient of the response.
+
+    calibrated_up (3,): where the response counts nothing, because A3 was fitted there.
+
+    The m coefficients are the zeros (rad), the scales (shares) and, for each pair of axes, the share of one axis' angle
+    that the other shows.
+    """
+    axes = len(theta)
+    then, turns = _zeroed(tuple(calibrated_up.tolist()), axes)
+    lean = (theta - then).tolist()
+    # change of each angle for each coefficient
+    angles = np.zeros((axes, RESPONSE_COEFFICIENTS[axes]))
+    for k in range(axes):
+        angles[k, k], angles[k, axes + k] = 1.0, lean[k]
+    for k, (i, j) in enumerate(combinations(range(axes), 2), 2 * axes):
+        angles[i, k], angles[j, k] = lean[j], lean[i]
+    columns = up_slope(theta, up) @ angles
+    # a rotation of S by up x moved takes up there by `moved`
+    columns[:, :axes] += rotation.cross_matrix(up) @ turns.T
+    return columns
+
+
+def stated_variances(errors: InclinometerErrors, axes: int) -> np.ndarray:
+    """Variances (m,) of the coefficients as the sensor's errors state them; its zero is part of A3's error."""
+    pairs = axes * (axes - 1) // 2
+    return np.array([0.0] * axes + [errors.scale**2] * axes + [errors.cross**2] * pairs)

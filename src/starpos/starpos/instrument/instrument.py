@@ -5,18 +5,31 @@ import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from functools import cached_property, lru_cache
-from typing import Protocol
 
 import numpy as np
 
 from starpos import rotation
+from starpos._numeric.roots import symmetric_root
 from starpos.errors import InstrumentError, TiltError
 from starpos.frames.exposure import Exposure, Shutter
+from starpos.frames.frame import Frame, Stars
 from starpos.frames.gravity import contradicts
+from starpos.frozen import at_once
 from starpos.instrument.camera import EQUIDISTANT, PLUMB_BOB, Camera
-from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
-from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Mounting
-from starpos.instrument.sensors import built_in_rad, find, is_built_in, unnamed
+from starpos.instrument.inclinometer import (
+    EITHER_WAY,
+    EXACT,
+    RESPONSE_COEFFICIENTS,
+    UNMEASURED_JUMP_C,
+    InclinometerErrors,
+    Tilt,
+    angles_at,
+    level_of,
+    response_columns,
+    stated_variances,
+    up_of,
+)
+from starpos.instrument.sensors import built_in_rad, find, unnamed
 from starpos.instrument.tilt_log import Tilts
 from starpos.units import ARCSEC, DAY_S, utc_text
 
@@ -106,7 +119,7 @@ class ByGravity:
         if self.log is not None:
             return self.log
         assert gravity is not None
-        if gravity.model != model and is_built_in(model):
+        if gravity.model != model and built_in_rad(model):
             raise TiltError(
                 f"{frame.place}: its level is a {gravity.model}'s, the others' a {model}'s: solve them apart"
             )
@@ -154,6 +167,8 @@ class ByGravity:
 TOP_OF_FRAME = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 # 1 sigma about S's axes of an A3 without a stated error: 10 deg, and any turn about the plumb line
 UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)
+# how long an A3 that is found may be used
+VALID_DAYS = 365.0
 # Limits of a calibration: an error of several turns means unknown; no inclinometer is hotter.
 MAX_ARCSEC, MAX_C = 1e7, 200.0
 MAX_CLOCK_S = 86400.0
@@ -180,7 +195,7 @@ class Calibration:
     tilt_deg : its two or three angles then; an error of the scale grows with the distance from them
     frames : number of frames it was found from
     valid_days : how long it may be used
-    response : coefficients of the inclinometer's response that were found with A3 (mounting.py), or ()
+    response : coefficients of the inclinometer's response that were found with A3 (inclinometer.py), or ()
     response_covariance : square, of these
 
     Examples
@@ -286,7 +301,7 @@ class Calibration:
             covariance_arcsec2=tuple(map(tuple, covariance.tolist())),
         )
 
-    @property
+    @cached_property
     def a3(self) -> np.ndarray:
         """The rotation A3 (3, 3), C into S."""
         rx, ry, rz = np.radians(self.misalignment_deg)
@@ -294,9 +309,44 @@ class Calibration:
 
     def turned_to(self, a3: np.ndarray) -> "Calibration":
         """The calibration with another A3 (3, 3)."""
-        rx, ry = np.arctan2(a3[2, 1], a3[2, 2]), np.arcsin(np.clip(-a3[2, 0], -1, 1))
-        rz = np.arctan2(a3[1, 0], a3[0, 0])
+        rx, ry = np.arctan2(a3[2, 1], a3[2, 2]), np.arctan2(-a3[2, 0], np.hypot(a3[2, 1], a3[2, 2]))
+        # what is left is about Z, also where ry is 90 deg and rx is any angle
+        left = a3 @ (rotation.about_axis(1, ry) @ rotation.about_axis(0, rx)).T
+        rz = np.arctan2(left[1, 0], left[0, 0])
         return replace(self, misalignment_deg=tuple(float(x) for x in np.degrees([rx, ry, rz])))
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """Covariance (3, 3) in rad2 of A3."""
+        return np.asarray(self.covariance_arcsec2, float) * ARCSEC**2
+
+    @cached_property
+    def covariance_root(self) -> np.ndarray:
+        """The symmetric root (3, 3) in rad of this covariance."""
+        return symmetric_root(self.covariance)
+
+    @cached_property
+    def response_root(self) -> np.ndarray:
+        """The symmetric root (m, m) of the covariance of the response."""
+        return symmetric_root(self.response_covariance)
+
+    @cached_property
+    def up(self) -> np.ndarray:
+        """Up (3,) in S when it was found."""
+        return up_of(np.radians(self.tilt_deg))
+
+    def warmer_c(self, tilt: Tilt) -> float:
+        """The inclinometer's temperature at a tilt minus the calibration's; NaN if one is unknown."""
+        return tilt.temperature_c - self.temperature_c
+
+    @property
+    def unmeasured_c(self) -> float:
+        """1 sigma of `warmer_c` where it is unknown.
+
+        If a calibration has neither a date nor a temperature, its stated error holds for all temperatures: 0.
+        """
+        dated = np.isfinite([self.utc_unix_s, self.temperature_c]).any()
+        return UNMEASURED_JUMP_C if dated else 0.0
 
     @property
     def angle_covariance_deg2(self) -> np.ndarray:
@@ -333,6 +383,32 @@ class Calibration:
                 f"the calibration of {utc_text(self.utc_unix_s)} is {age_days:.0f} days from this frame and holds for "
                 f"{self.valid_days:g}: calibrate again, or raise valid_days in the instrument file"
             )
+
+
+# lower bound of the cosine that turns an error of the sine into one of the angle
+MIN_COSINE = 0.1
+
+
+@at_once
+@dataclass(frozen=True)
+class LocalLevel:
+    """The local level L that a tilt shows.
+
+    up        (3,) in S, corrected by the response
+    a2        (3, 3): S into L
+    camera    (3, 3): C into L, A2 A3
+    response  (3, m): change of up for 1 sigma of each error of the response
+    """
+
+    up: np.ndarray
+    a2: np.ndarray
+    camera: np.ndarray
+    response: np.ndarray
+
+    @cached_property
+    def turns(self) -> np.ndarray:
+        """Matrix (3, 3) from a change of up (3,) in S to a small rotation (3,) of L about its axes; zero about Z."""
+        return np.array([self.a2[1], -self.a2[0], np.zeros(3)])
 
 
 @dataclass(frozen=True)
@@ -405,7 +481,7 @@ class Instrument:
     @property
     def has_level_inside(self) -> bool:
         """Whether the inclinometer is a camera's own, whose axes are near the camera's."""
-        return is_built_in(self.inclinometer_model) and not self.calibration.unknown
+        return built_in_rad(self.inclinometer_model) > 0 and not self.calibration.unknown
 
     def levelled_by(self, model: str) -> "Instrument":
         """The instrument with a level of this model inside its camera, as far as A3 and the inclinometer are unknown."""
@@ -451,24 +527,33 @@ class Instrument:
             return camera
         return camera.part(-origin_px[0], -origin_px[1], *self.size)
 
-    @property
-    def mounting(self) -> Mounting:
-        """A3 and the base link as matrices, with their errors."""
+    def level(self, tilt: Tilt) -> LocalLevel:
+        """The level at a tilt; InstrumentError if the response is of a sensor with another number of axes.
+
+        TiltError if it may point up or down.
+
+        Zeros that were not calibrated are assumed to err by the contradiction of the axes.
+        """
         c = self.calibration
-        return Mounting(
-            a3=c.a3,
-            link_to_camera=np.asarray(self.link_to_camera, float),
-            link_stddev_rad=self.mount_stddev_arcsec * ARCSEC,
-            lens_stddev_rad=self.lens_stddev_rad,
-            calibration_covariance=np.asarray(c.covariance_arcsec2, float) * ARCSEC**2,
-            remounted_rad=c.remounted_arcsec * ARCSEC,
-            inclinometer=self.inclinometer,
-            calibrated_unix_s=c.utc_unix_s,
-            calibrated_temperature_c=c.temperature_c,
-            calibrated_tilt=tuple(np.radians(c.tilt_deg)),
-            response=c.response,
-            response_covariance=c.response_covariance,
-        )
+        if tilt.either_way:
+            raise TiltError(EITHER_WAY)
+        if c.response:
+            columns = response_columns(tilt.theta, tilt.up, c.up)
+            if columns.shape[1] != len(c.response):
+                raise InstrumentError(
+                    f"the calibration's response has {len(c.response)} coefficients, and a tilt of {tilt.axes} axes "
+                    f"needs {columns.shape[1]}: calibrate with the inclinometer that is used"
+                )
+            up, response = rotation.normalised(tilt.up - columns @ c.response), columns @ c.response_root
+        else:
+            # with three axes the consistent angles, as at the calibration: so nothing counts at its lean
+            up, theta = tilt.up, angles_at(tilt.up, tilt.axes)
+            variances = stated_variances(self.inclinometer, tilt.axes)
+            wrong = self.inclinometer.contradiction(tilt) / np.maximum(np.cos(theta), MIN_COSINE)
+            variances[: tilt.axes] += wrong**2
+            response = response_columns(theta, tilt.up, c.up) * np.sqrt(variances)
+        a2 = level_of(up)
+        return LocalLevel(up, a2, a2 @ c.a3, response)
 
 
 def focal_px_of(focal_mm: float, pixel_um: float) -> float:
@@ -495,61 +580,27 @@ FISHEYE_AXIS = 0.04
 SIZE_IN_FILE = "camera: {focal_mm, pixel_um, width, height} in the instrument file"
 
 
-class Framed(Protocol):
-    """A frame's geometry, in px."""
-
-    @property
-    def width(self) -> int:
-        """Its width."""
-
-    @property
-    def height(self) -> int:
-        """Its height."""
-
-    @property
-    def origin_px(self) -> tuple[float, float] | None:
-        """Column and row of the sensor's whole frame at which it begins, as an Exposure has it."""
-
-
-@dataclass(frozen=True)
-class AxisDoubt:
-    """Why the optical axis's place in frames is unknown; its 1 sigma in px and rad, 0 if it does not count."""
-
-    why: str
-    error_px: float = 0.0
-    error_rad: float = 0.0
-
-    def counted_as(self, error: str) -> str:
-        """The doubt as a sentence; error: the error that it becomes a part of."""
-        if not self.error_px:
-            return (
-                f"{self.why}: if they are cut out of larger ones, the optical axis may be off their middle and the place "
-                f"wrong: give the whole frame's size, {SIZE_IN_FILE}"
-            )
-        return (
-            f"{self.why}: the optical axis may be {self.error_px:.0f} px from their centre, "
-            f"{math.degrees(self.error_rad):.2g} deg that count as an error of {error}: give the whole frame's size, "
-            f"{SIZE_IN_FILE}"
-        )
-
-
-def framed(instrument: Instrument, first: Framed) -> tuple[Instrument, AxisDoubt | None]:
-    """The instrument for the frames of a night by the first of them; and a doubt if their axis is not known.
+def framed(instrument: Instrument, first: Frame | Stars, error: str) -> tuple[Instrument, str]:
+    """The instrument for the frames of a night by the first of them; and a sentence if their axis is not known, else ''.
 
     An instrument that knows its frame's size stays as it is.  Else a frame counts as a whole one, and its size holds for
-    the others, unless its header says that it begins somewhere on a sensor, or no sensor has its shape.  A standard size
-    may be either: that is a doubt, which is not counted.
+    the others, unless its header says that it begins somewhere on a sensor, or no sensor has its shape: then
+    axis_stddev_rad has the axis's error, and `error` says of what it becomes a part.  A standard size may be either: that
+    is a doubt, which is not counted.
     """
     if instrument.size is not None:
-        return instrument, None
+        return instrument, ""
     width, height, origin_px = first.width, first.height, first.origin_px
     longer, shorter = max(width, height), min(width, height)
     if origin_px is None:
         instrument = replace(instrument, frame_size=(width, height))
         if any(abs(longer / shorter / shape - 1) < SHAPE_OFF for shape in SENSOR_SHAPES):
-            doubtful = (longer, shorter) in STANDARD_SIZES
-            whole = AxisDoubt(f"frames of {width} x {height} px count as whole ones")
-            return instrument, whole if doubtful else None
+            if (longer, shorter) not in STANDARD_SIZES:
+                return instrument, ""
+            return instrument, (
+                f"frames of {width} x {height} px count as whole ones: if they are cut out of larger ones, the optical "
+                f"axis may be off their middle and the place wrong: give the whole frame's size, {SIZE_IN_FILE}"
+            )
         why = f"no sensor has the shape of frames of {width} x {height} px"
     elif np.isfinite(origin_px).all():
         left, top = origin_px
@@ -565,20 +616,23 @@ def framed(instrument: Instrument, first: Framed) -> tuple[Instrument, AxisDoubt
     error_px = max(longer, MIN_UNKNOWN_PX)
     if instrument.model == EQUIDISTANT:
         error_px = min(error_px, FISHEYE_AXIS * instrument.focal_px)
-    return instrument, AxisDoubt(why, error_px, math.atan(error_px / instrument.focal_px))
+    error_rad = math.atan(error_px / instrument.focal_px)
+    return replace(instrument, axis_stddev_rad=error_rad), (
+        f"{why}: the optical axis may be {error_px:.0f} px from their centre, {math.degrees(error_rad):.2g} deg that "
+        f"count as an error of {error}: give the whole frame's size, {SIZE_IN_FILE}"
+    )
 
 
-def with_frame_size(instrument: Instrument, first: Framed) -> tuple[Instrument, str]:
+def with_frame_size(instrument: Instrument, first: Frame | Stars) -> tuple[Instrument, str]:
     """The instrument as `framed` has it, with the axis's error included in A3's, and its doubt; '' if A3 is not known.
 
-    The error stands in axis_stddev_rad too, for headings at a known place, which need no A3.
+    Headings at a known place, which need no A3, take the error from axis_stddev_rad.
     """
-    instrument, doubt = framed(instrument, first)
-    if doubt is not None:
-        instrument = replace(instrument, axis_stddev_rad=doubt.error_rad)
+    instrument, doubt = framed(instrument, first, "A3")
     calibration = instrument.calibration
-    if doubt is None or calibration.unknown:
+    if not doubt or calibration.unknown:
         return instrument, ""
-    widened = np.asarray(calibration.covariance_arcsec2, float) + np.eye(3) * (doubt.error_rad / ARCSEC) ** 2
+    axis2 = (instrument.axis_stddev_rad / ARCSEC) ** 2
+    widened = np.asarray(calibration.covariance_arcsec2, float) + np.eye(3) * axis2
     wide = replace(calibration, covariance_arcsec2=tuple(map(tuple, widened.tolist())))
-    return replace(instrument, calibration=wide), doubt.counted_as("A3")
+    return replace(instrument, calibration=wide), doubt

@@ -18,7 +18,7 @@ import numpy as np
 from starpos import files, rotation
 from starpos.errors import InstrumentError
 from starpos.frames.fits import rms_config
-from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.instrument.camera import EQUIDISTANT, Camera, pixels_over
 from starpos.instrument.instrument import Instrument
 from starpos.units import DAY_S, UNIX_EPOCH_JD
 
@@ -72,7 +72,7 @@ def _of_config(text: str) -> RmsCamera:
 
 
 def _of_platepar(plate: Mapping[str, Any]) -> RmsCamera:
-    xy = _grid(int(plate["X_res"]), int(plate["Y_res"]))
+    xy = pixels_over(int(plate["X_res"]), int(plate["Y_res"]), SIDE)
     aspect, off = _undistorted(plate, xy)
     theta = np.radians(np.hypot(*off.T) / float(plate["F_scale"]))
     use = np.isfinite(theta) & (theta < FURTHEST)
@@ -96,12 +96,6 @@ def _station(camera: Camera, latitude_deg: float, longitude_deg: float, height_m
     if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and np.isfinite(height_m)):
         raise InstrumentError(f"its place {latitude_deg:g} {longitude_deg:g} cannot be")
     return RmsCamera(Instrument(camera.fx, camera=camera), latitude_deg, longitude_deg, height_m)
-
-
-def _grid(width: int, height: int) -> np.ndarray:
-    """Pixels (N, 2) all over a frame."""
-    x, y = np.meshgrid(np.linspace(0, width - 1, SIDE), np.linspace(0, height - 1, SIDE))
-    return np.stack([x.ravel(), y.ravel()], -1)
 
 
 def _radial_fit(xy: np.ndarray, theta: np.ndarray, phi: np.ndarray, aspect: float) -> np.ndarray:
@@ -215,7 +209,7 @@ def platepar_of(
 
 def _lens_terms(camera: Camera) -> dict[str, Any]:
     """The keys of a platepar that say what its lens is like, by fits of the camera all over its frame."""
-    xy = _grid(camera.width, camera.height)
+    xy = pixels_over(camera.width, camera.height, SIDE)
     xy = xy[camera.sees(*xy.T)]
     rays = camera.directions(*xy.T)
     theta, phi = np.arccos(np.clip(rays[:, 2], -1, 1)), np.arctan2(rays[:, 1], rays[:, 0])

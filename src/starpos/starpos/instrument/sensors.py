@@ -58,14 +58,9 @@ def presets() -> Mapping[str, InclinometerErrors]:
     )
 
 
-def is_built_in(model: str) -> bool:
-    """Whether a model is a camera's own level."""
-    return BUILT_IN in _rows().get(model, ())
-
-
 def built_in_rad(model: str) -> float:
-    """1 sigma about each axis of a camera's own level against it, its zero included; KeyError if it is not one."""
-    return _rows()[model][BUILT_IN]
+    """1 sigma about each axis of a camera's own level against it, its zero included; 0 for another level."""
+    return _rows().get(model, {}).get(BUILT_IN, 0.0)
 
 
 @lru_cache(maxsize=1)

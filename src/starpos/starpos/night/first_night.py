@@ -218,7 +218,7 @@ class FirstNight:
         mirrored: as if Y' had the wrong sign.
         """
         sign = np.array([1.0, -1.0 if mirrored else 1.0, 1.0])
-        a3 = self._solver.instrument.mounting.a3
+        a3 = self._solver.instrument.calibration.a3
         turns = np.radians(np.arange(-180.0, 180.0, 0.5))
         square = np.zeros(len(turns))
         for pose in leans:

@@ -24,10 +24,9 @@ from starpos.frames.gravity import PHONE
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt, level_of, up_of
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.instrument.mounting import Mounting
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilt_table import like_radians
-from starpos.rotation import half_turn
+from starpos.rotation import angle, half_turn
 from starpos.units import HOUR_S, utc_text
 
 # sigma of two coordinates together, beyond which a place is once in 100
@@ -227,23 +226,22 @@ class Near:
 
 
 def doubts(
-    fixes: Sequence[Fix], whole: Fix | Average, mounting: Mounting | None, near: Near | None
+    fixes: Sequence[Fix], whole: Fix | Average, a3: np.ndarray | None, near: Near | None
 ) -> tuple[str, ...]:
     """Report places that mistaken tilts set apart, and a place far from `near`.
 
-    mounting: of the fixes' frames, None if A3 was not given: then it is not checked.
+    a3 (3, 3): of the fixes' frames, None if it was not given: then it is not checked.
     """
     frames: list[Leaning] = [(f.camera.rotation, f.tilt) for f in fixes]
-    return _mistaken(mounting, frames), "" if near is None else _far(near, whole, mounting, frames[-1:])
+    return _mistaken(a3, frames), "" if near is None else _far(near, whole, a3, frames[-1:])
 
 
 def apart_m(a: tuple[float, float], b: tuple[float, float]) -> float:
     """Distance in m on a sphere of two places (latitude, longitude) in rad."""
-    up, other = zenith_of(*a), zenith_of(*b)
-    return EARTH_RADIUS_M * float(np.arctan2(np.linalg.norm(np.cross(up, other)), up @ other))
+    return EARTH_RADIUS_M * float(angle(zenith_of(*a), zenith_of(*b)))
 
 
-def _far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequence[Leaning]) -> str:
+def _far(near: Near, fix: Fix | Average, a3: np.ndarray | None, frames: Sequence[Leaning]) -> str:
     """Say that a fix lies far from a place, and which mistake would explain it; '' if it does not."""
     km = near.km_from(fix.latitude, fix.longitude)
     within_km = near.km + FAR_SIGMA * float(np.sqrt(np.diag(fix.covariance)[:2].max())) / 1000
@@ -257,7 +255,7 @@ def _far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequ
         if not ahead_h:
             return ""
         return f"{told}: its times may be {abs(ahead_h):g} h {side} UTC, or the header counts longitudes to the west"
-    for name, places in _places(mounting, frames):
+    for name, places in _places(a3, frames):
         off = [near.km_from(*place) for place in places]
         if max(off) <= near.km:
             return f"{told}: with {name} it would be {max(off):.0f} km from there: check the tilts"
@@ -274,17 +272,17 @@ def _hours_ahead(near: Near, fix: Fix | Average) -> float:
     return hours if near.km_from(fix.latitude, turned) <= near.km else 0.0
 
 
-def _mistaken(mounting: Mounting | None, frames: Sequence[Leaning]) -> str:
+def _mistaken(a3: np.ndarray | None, frames: Sequence[Leaning]) -> str:
     """Say which mistake has set the places of frames far apart; '' if none explains it.
 
     One heading alone never shows it: the same mistake then moves all places alike.
     """
-    if mounting is None:
+    if a3 is None:
         return ""
-    spread_m = _spread_m([_place(camera, tilt.theta, mounting) for camera, tilt in frames])
+    spread_m = _spread_m([_place(camera, tilt.theta, a3) for camera, tilt in frames])
     if spread_m < APART_M:
         return ""
-    for name, places in _places(mounting, frames):
+    for name, places in _places(a3, frames):
         if (left_m := _spread_m(places)) < spread_m / NEARER:
             return (
                 f"the frames' places lie {length_text(spread_m)} apart, and with {name} {length_text(left_m)}: "
@@ -293,11 +291,9 @@ def _mistaken(mounting: Mounting | None, frames: Sequence[Leaning]) -> str:
     return ""
 
 
-def _places(
-    mounting: Mounting | None, frames: Sequence[Leaning]
-) -> list[tuple[str, list[tuple[float, float]]]]:
+def _places(a3: np.ndarray | None, frames: Sequence[Leaning]) -> list[tuple[str, list[tuple[float, float]]]]:
     """The places of frames with two-axis tilts, by mistake."""
-    if mounting is None or not frames or any(tilt.axes != 2 for _, tilt in frames):
+    if a3 is None or not frames or any(tilt.axes != 2 for _, tilt in frames):
         return []
     theta = np.array([tilt.theta for _, tilt in frames])
     found = []
@@ -307,15 +303,15 @@ def _places(
             found.append(
                 (
                     name,
-                    [_place(camera, one, mounting) for (camera, _), one in zip(frames, angles, strict=True)],
+                    [_place(camera, one, a3) for (camera, _), one in zip(frames, angles, strict=True)],
                 )
             )
     return found
 
 
-def _place(camera_to_itrs: np.ndarray, theta: np.ndarray, mounting: Mounting) -> tuple[float, float]:
+def _place(camera_to_itrs: np.ndarray, theta: np.ndarray, a3: np.ndarray) -> tuple[float, float]:
     """Latitude, longitude (rad) of a frame with a tilt, without refraction."""
-    place = local_north(level_of(up_of(theta)) @ mounting.a3 @ camera_to_itrs.T)
+    place = local_north(level_of(up_of(theta)) @ a3 @ camera_to_itrs.T)
     return place.latitude, place.longitude
 
 

@@ -234,10 +234,10 @@ def _steady(night: Night, instrument: Instrument) -> np.ndarray | None:
     turned = np.abs(half_turns(headings - headings[0])).max()
     if len(tilts) < 3 or moved > STILL_SIGMA * noise + 1.0 or turned > np.radians(1.0):
         return None
-    g = level_of(up_of(tilts.mean(0))) @ instrument.mounting.a3
+    g = level_of(up_of(tilts.mean(0))) @ instrument.calibration.a3
     steady = []
     for camera_to_itrs in attitudes:
         place = local_north(g @ camera_to_itrs.T)
-        link_to_enu = place.local_to_enu @ g @ instrument.mounting.link_to_camera
+        link_to_enu = place.local_to_enu @ g @ instrument.link_to_camera
         steady.append((place.latitude, place.longitude, heading_of(link_to_enu)))
     return np.array(steady)

@@ -128,16 +128,16 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
     place = fixes[-1] if whole is None else whole
     said = [remarks.of_extrapolation(gathered.solved)]
     said += [] if whole is None else remarks.of_average(whole, gathered.solved)
-    mounting = None
+    a3 = None
     if given is not None:
         said += [unnamed_inclinometer(given), unknown_a3(given.calibration, place.covariance, place.terms)]
         if given.vertical is None and not given.calibration.unknown:
-            mounting = given.mounting
+            a3 = given.calibration.a3
         said += [] if whole is None else [remarks.of_table(fixes, whole, given)]
         said += [remarks.of_copies(fixes)] if given.has_level_inside else []
     said += [
         remarks.of_marks(place, gathered.marks_deg),
-        *doubts(fixes, place, mounting, near or gathered.site),
+        *doubts(fixes, place, a3, near or gathered.site),
     ]
     return Together(whole, why_not, tuple(filter(None, said)))
 
@@ -145,7 +145,7 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
 def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
     """The place by the circles of the Sun, or of the Moon."""
     try:
-        if Directions.of(sorted(circles, key=lambda c: c.utc_unix_s)).wide:
+        if Directions.of(circles).wide:
             raise FixError(
                 "the Sun's elevations determine a place only where A3 is known to 6 arcmin: find it by night with "
                 "starpos calibrate --site"
@@ -232,7 +232,7 @@ def from_elevations(
         return Elevations(tuple(circles), Together())
     there, axis = None if near is None else (near.latitude, near.longitude), None
     try:
-        directions = Directions.of(sorted(sound, key=lambda c: c.utc_unix_s))
+        directions = Directions.of(sound)
         if self_calibrate or (directions.wide and len(directions.circles) >= MIN_WITHOUT_SITE):
             axis = axis_of(solver, pointings, tilts, there)
             # A3's error is counted from the given A3, or from the one found if none was given
@@ -275,18 +275,16 @@ def axis_of(
         with suppress(StarposError):
             levelled.append((pointing, *solver.levelled(pointing, tilts)))
 
-    camera = solver.instrument.camera or IDEAL
+    camera, given = solver.instrument.camera or IDEAL, solver.instrument.calibration
 
     def with_a3(a3: np.ndarray) -> list[Circle]:
-        mounting = replace(solver.instrument.mounting, a3=a3)
+        turned = replace(solver, instrument=replace(solver.instrument, calibration=given.turned_to(a3)))
         circles = []
         for pointing, state, tilt in levelled:
-            about = replace(solver.circumstances(pointing, camera, state), mounting=mounting)
             with suppress(FixError):
-                circles.append(circle_of(pointing, tilt, about))
+                circles.append(circle_of(pointing, tilt, turned.circumstances(pointing, camera, state)))
         return circles
 
-    given = solver.instrument.calibration
     return find_axis(with_a3, given, camera.centre_ray, site, near)
 
 

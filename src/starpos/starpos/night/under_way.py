@@ -15,7 +15,7 @@ from starpos.errors import FixError, FrameError, InstrumentError, TimeError, Voy
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument import instrument_file
-from starpos.instrument.instrument import AxisDoubt, Instrument, framed
+from starpos.instrument.instrument import Instrument, framed
 from starpos.navigation.records import ImuModel, read_imu, read_imu_model, read_velocity
 from starpos.navigation.sightings import PlacelessFrame, sighting_of
 from starpos.navigation.vessel import Vessel
@@ -26,7 +26,7 @@ from starpos.parallel.processes import in_turn
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
 
-MOUNT_STDDEV_DEG, MAX_MOUNT_DEG = 1.0, 20.0
+MOUNT, MOUNT_STDDEV_DEG, MAX_MOUNT_DEG = "the mount", 1.0, 20.0
 # of a given height: the geoid, and hills on the way
 GIVEN_HEIGHT_STDDEV_M = 100.0
 
@@ -55,24 +55,23 @@ def voyage_frame(given: Instruments, item: Frame | Stars) -> VoyageFrame:
 def vessel_of(
     instrument: Instrument,
     atmosphere: Atmosphere,
-    axis: AxisDoubt | None = None,
+    doubt: str = "",
     *,
     mount_stddev_deg: float = MOUNT_STDDEV_DEG,
     height_m: float | None = None,
     imu_model: str | Path | None = None,
     vehicle: str | None = None,
     drift_stddev: float = 0.0,
-) -> tuple[Vessel, str]:
-    """The vessel, and a remark if the mount's error includes an unknown axis; InstrumentError if it is too large.
+) -> Vessel:
+    """The vessel, whose mount's error includes the instrument's unknown axis; InstrumentError if it is too large.
 
+    doubt: of that axis, as `framed` has it.
     mount_stddev_deg: error of the camera's stated orientation on the vehicle.  height_m: of it; None: not known.
     imu_model: kalibr's YAML; None: a cheap one.  vehicle, drift_stddev: as of `Vessel`.
     """
-    stddev, remark = math.radians(mount_stddev_deg), ""
-    if axis is not None:
-        remark, stddev = axis.counted_as("the mount"), math.hypot(stddev, axis.error_rad)
-        if math.degrees(stddev) > MAX_MOUNT_DEG:
-            raise InstrumentError(f"{remark}; with a mount known no better, there is no position under way")
+    stddev = math.hypot(math.radians(mount_stddev_deg), instrument.axis_stddev_rad)
+    if doubt and math.degrees(stddev) > MAX_MOUNT_DEG:
+        raise InstrumentError(f"{doubt}; with a mount known no better, there is no position under way")
     vessel = Vessel(
         model=ImuModel() if imu_model is None else read_imu_model(Path(imu_model)),
         camera_to_body=np.asarray(instrument.link_to_camera, float).T,
@@ -84,7 +83,7 @@ def vessel_of(
     )
     if height_m is not None:
         vessel = replace(vessel, height_m=height_m, height_stddev_m=GIVEN_HEIGHT_STDDEV_M)
-    return vessel, remark
+    return vessel
 
 
 def voyage_of(
@@ -152,9 +151,9 @@ def navigate(
     about = read.first(paths)
     if about is None:
         raise VoyageError(f"none of the {len(paths)} frames can be read: give star lists or frames")
-    whole, axis = framed(known, about)
+    whole, doubt = framed(known, about, MOUNT)
     air = Atmosphere.measured(None, None) if atmosphere is None else atmosphere
-    vessel, _ = vessel_of(whole, air, axis, **assumed)
+    vessel = vessel_of(whole, air, doubt, **assumed)
     work = partial(read.on, partial(voyage_frame, Instruments(whole)))
     placed = voyage_frames(in_turn((work, path) for path in paths))
     return voyage_of(placed, str(imu), None if velocity is None else str(velocity), vessel, progress)

@@ -164,7 +164,6 @@ class NavigatorSession:
             # If the user sets clock_stddev, it replaces the error that the camera's host states.
             if not np.isnan(self._values["clock_stddev"]):
                 attitude = replace(attitude, clock_stddev_s=0.0)
-            assert attitude.utc_unix_s is not None
             by_sun, place = attitude.ray is not None, None
             if by_sun or self._estimate is None or self._stars_missing:
                 place = self._place_at(attitude.utc_unix_s)

@@ -108,7 +108,7 @@ class Scene:
     @property
     def tilt(self) -> tuple[float, float]:
         """True theta_x, theta_y in rad."""
-        up = self.instrument.mounting.a3 @ self.attitude[2]
+        up = self.instrument.calibration.a3 @ self.attitude[2]
         return float(np.arcsin(up[0])), float(np.arcsin(up[1]))
 
 

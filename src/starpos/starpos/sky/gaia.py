@@ -14,6 +14,7 @@ import numpy as np
 
 from starpos.errors import CatalogueError
 from starpos.files import open_regular
+from starpos.rotation import unit_vector
 from starpos.sky.catalogue import (
     CENTI,
     CODE_STEP,
@@ -195,7 +196,7 @@ def _matched(base: Catalogue, extract: Extract) -> tuple[np.ndarray, np.ndarray]
 
     year = float(np.median(extract.epoch))
     ra, dec = (np.radians(a) for a in extract.at(year))
-    tree = cKDTree(np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], -1))
+    tree = cKDTree(unit_vector(ra, dec))
     seen = base.directions(slice(None), year)
     apart, nearest = tree.query(seen, k=2, distance_upper_bound=NEIGHBOUR_MAS * MAS)
     within = apart[:, 0] < base.sigma(slice(None), year) * MATCH_SIGMA + MATCH_MAS * MAS

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.orientation import ROTATION_RAD_S, EarthOrientation, EarthState, later, station_velocity
+from starpos.earth.orientation import ROTATION_RAD_S, EarthOrientation, station_velocity
 from starpos.earth.place import Place
 from starpos.errors import FixError, InstrumentError
 from starpos.fix._adjustment import gain_of, spread
@@ -23,13 +23,13 @@ from starpos.fix.solver import ENOUGH_SOUND, Solver
 from starpos.fix.star_fit import (
     ISOTROPIC,
     MatchedStars,
+    apparent,
     expected_extra,
     fitted,
     seen_problem,
     share_free,
     sound_matches,
 )
-from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Stars
 from starpos.frozen import at_once
 from starpos.identification import Identification
@@ -111,9 +111,8 @@ def sighting(
     camera = camera.scaled(found.focal_scale)
     places = catalogue.directions(index, state.year, state.observer_au)
     matched = MatchedStars.of(stars, found, use, camera, catalogue, state.year, places)
-    shutter = solver.shutter(stars)
-    itrs = _seen(matched, state, shutter, camera.height, mark)
-    enu = itrs @ mark.axes.T
+    about = solver.circumstances(stars, camera, state)
+    enu = rotation.normalised(apparent(matched, about) + station_velocity(mark.axes[2])) @ mark.axes.T
     refraction = solver.atmosphere.refraction()
     problem = seen_problem(matched.xy, camera, refraction.bend(enu))
     # the catalogue's errors do not weigh here: `places` adjusts them with all frames' stars
@@ -138,7 +137,7 @@ def sighting(
     stronger = solver.atmosphere.refraction(1 + STRONGER).bend(enu)[kept] - refraction.bend(enu)[kept]
     bent_px = np.einsum("nij,njk,nk->ni", turns, across, stronger @ fit.a4.T)
     pole = fit.a4 @ mark.axes[:, 2]
-    late_s = shutter.errors_s(matched.xy[kept, 1], camera.height)
+    late_s = about.shutter.errors_s(matched.xy[kept, 1], camera.height)
     drift_px = turns @ (-ROTATION_RAD_S * pole)
     return ZenithSighting(
         source=stars.source,
@@ -154,7 +153,7 @@ def sighting(
         residual_arcsec=residual * camera.scale_arcsec,
         tilt=tilt,
         orientation=state.orientation,
-        clock_stddev_s=solver.clock_stddev_s(stars),
+        clock_stddev_s=about.clock_stddev_s,
         stamp_stddev_s=stars.stamp_stddev_s,
     )
 
@@ -167,12 +166,6 @@ def centroids_of(residual: np.ndarray, stated: np.ndarray, placed_px: np.ndarray
     """
     whole = stated + ISOTROPIC * placed_px[:, None, None] ** 2
     return stated + ISOTROPIC * expected_extra(residual, whole, share)
-
-
-def _seen(stars: MatchedStars, state: EarthState, shutter: Shutter, height: int, mark: Place) -> np.ndarray:
-    """Topocentric directions (N, 3) in ITRS, with the diurnal aberration, each when its row was exposed."""
-    itrs = later(state.to_itrs(stars.places), shutter.later_s(stars.xy[:, 1], height))
-    return rotation.normalised(itrs + station_velocity(mark.axes[2]))
 
 
 # within a face the heading stays: a turntable or a foot that settles moves it by less than this

@@ -32,7 +32,8 @@ def fixes(field, rng, headings, tilt=12.6, calibration=0.0, slip=None):
         xy, places = here.places(STATE, rng)
         made.append(here.solve(
             xy + rng.normal(0, 0.05, xy.shape), places, STATE,
-            tilt=Tilt(*reading, np.eye(2) * (tilt * ARCSEC) ** 2, utc_unix_s=UTC), mounting=here.mounting(calibration),
+            tilt=Tilt(*reading, np.eye(2) * (tilt * ARCSEC) ** 2, utc_unix_s=UTC),
+            instrument=here.instrument(calibration),
         ))  # fmt: skip
     return made
 

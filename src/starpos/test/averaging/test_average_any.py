@@ -56,7 +56,7 @@ def walk(rng, steps, spoil=0.0, drive=0.0, turn=0.2, latitude=None) -> Walk:
         xy, places = here.places(STATE, rng)
         up = slip @ here.a3 @ here.attitude[2]
         theta = np.arcsin(up[:2]) + rng.normal(0, NOISE, 2)
-        f = here.solve(xy + rng.normal(0, 0.05, xy.shape), places, STATE, mounting=here.mounting(5.0),
+        f = here.solve(xy + rng.normal(0, 0.05, xy.shape), places, STATE, instrument=here.instrument(5.0),
                        tilt=Tilt(*theta, np.eye(2) * NOISE**2, utc_unix_s=UTC))  # fmt: skip
         f = replace(f, utc_unix_s=now)
         bad = rng.random() < spoil

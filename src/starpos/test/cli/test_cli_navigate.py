@@ -9,8 +9,9 @@ import pytest
 from cli_calls import AIR, WIDE, objects
 
 from starpos.earth.refraction import Atmosphere
+from starpos.errors import InstrumentError
 from starpos.frames.reading import read_frame
-from starpos.instrument.instrument import AxisDoubt, Instrument
+from starpos.instrument.instrument import Instrument
 from starpos.night.reading import Instruments
 from starpos.night.under_way import vessel_of, voyage_frame
 from starpos_testing.command_line import run
@@ -142,10 +143,11 @@ def test_a_frame_keeps_the_errors_of_its_stamp_and_its_clock(voyage):
 
 
 def test_an_axis_that_nobody_knows_widens_the_mount():
-    doubt = AxisDoubt("cut out", 300.0, np.radians(4))
-    vessel, remark = vessel_of(Instrument(1000.0), Atmosphere(), doubt, mount_stddev_deg=3.0)
+    unknown = Instrument(1000.0, axis_stddev_rad=np.radians(4))
+    vessel = vessel_of(unknown, Atmosphere(), "cut out", mount_stddev_deg=3.0)
     assert vessel.mount_stddev == pytest.approx(np.radians(5))
-    assert "4 deg that count as an error of the mount" in remark
+    with pytest.raises(InstrumentError, match="cut out; with"):
+        vessel_of(unknown, Atmosphere(), "cut out", mount_stddev_deg=30.0)
 
 
 def test_a_wrong_header_keeps_no_frame_from_a_voyage(voyage, tmp_path, capsys):

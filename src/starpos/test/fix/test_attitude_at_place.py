@@ -15,6 +15,8 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.errors import PlaceError
+from starpos.fix.attitude import CAMERA as CAMERA_AXES
+from starpos.fix.attitude import LINK
 from starpos.fix.budget import Circumstances
 from starpos.fix.heading import attitude_at_place
 from starpos.fix.solver import placed
@@ -26,7 +28,7 @@ from starpos.units import ARCSEC, UNIX_EPOCH_JD, unix_of
 
 EXACT = Deflection(0.0, 0.0, 0.0)
 CAMERA = Camera.from_focal(1000, 700, 4636.0)
-MOUNTING = Instrument(CAMERA.fx).mounting
+INSTRUMENT = Instrument(CAMERA.fx)
 AIR = Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
 # 2024-02-10
 NIGHT = 1707595200.0
@@ -63,7 +65,11 @@ def place(deflection=EXACT, make=Place.by_gravity, **more):
 
 def attitude_of(stars, where=None, air=AIR, clock_s=0.0, unix_s=NIGHT, **more):
     about = Circumstances(
-        camera=CAMERA, mounting=MOUNTING, atmosphere=air, earth=earth_state(unix_s), clock_stddev_s=clock_s
+        camera=CAMERA,
+        instrument=INSTRUMENT,
+        atmosphere=air,
+        earth=earth_state(unix_s),
+        clock_stddev_s=clock_s,
     )
     return attitude_at_place(stars, where or place(), replace(about, **more))
 
@@ -180,8 +186,8 @@ def test_a_wrong_place_turns_the_attitude_by_its_term():
 
 def test_mount_and_lens_are_in_the_claim():
     stars, _ = ring(200.0, 88.0, 20.0)
-    mounting = Instrument(CAMERA.fx, mount_stddev_arcsec=30.0).mounting
-    found = attitude_of(stars, mounting=mounting, axis_stddev=40 * ARCSEC)
+    instrument = Instrument(CAMERA.fx, mount_stddev_arcsec=30.0)
+    found = attitude_of(stars, instrument=instrument, axis_stddev=40 * ARCSEC)
     # a wrong optical axis looks like a lean of the camera, which looks up
     sigma = np.sqrt(np.diag(found.plumb.angles_covariance)) / ARCSEC
     assert sigma == pytest.approx([30.0, 50.0, 50.0], rel=0.01)
@@ -291,7 +297,9 @@ def test_frames_through_dew_do_not_turn_the_mean_of_clear_ones(rng):
             errors = np.tile(np.eye(2) * sigma**2, (len(stars.xy), 1, 1))
             off = rng.normal(0, sigma, stars.xy.shape)
             seen.append(attitude_of(replace(stars, xy=stars.xy + off, covariance_px2=errors)))
-        mean = mean_attitude(seen).plumb
+        whole = mean_attitude(seen)
+        assert (whole.plumb.of, whole.optics.of) == (LINK, CAMERA_AXES)
+        mean = whole.plumb
         off = rotation.to_vector(mean.rotation @ link.T)
         z2.append(off @ np.linalg.solve(mean.covariance, off) / 3)
         assert np.linalg.norm(off) < 20 * ARCSEC

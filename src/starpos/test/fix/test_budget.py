@@ -9,30 +9,25 @@ import pytest
 from starpos import rotation
 from starpos.earth.orientation import earth_state
 from starpos.fix.terms import Origin
-from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
-from starpos.instrument.mounting import Mounting
+from starpos.instrument.inclinometer import InclinometerErrors, Tilt
+from starpos.instrument.instrument import Calibration
 from starpos.units import ARCSEC
-from starpos_testing.skies.fields import UTC, SkyField
+from starpos_testing.skies.fields import QUIET, UTC, SkyField
 
 STATE = earth_state(UTC)
 # East, north at 35.7 deg, radii of WGS 84.
 ARCSEC_M = (30.95, 30.82)
-NONE = np.zeros((3, 3))
 
 
-def fixed(field, rng, errors=EXACT, turn_sigma=None, **mounting):
+def fixed(field, rng, errors=QUIET, turn_sigma=0.0, **calibration):
     """A fix of a field whose camera is the inclinometer's frame."""
     xy, places = field.places(STATE, rng)
-    about = NONE if turn_sigma is None else np.diag([0.0, 0.0, turn_sigma**2])
-    told = Mounting(
-        a3=field.a3,
-        link_to_camera=field.mounting().link_to_camera,
-        calibration_covariance=about,
-        inclinometer=errors,
-        **mounting,
+    known = replace(
+        Calibration.of(field.misalignment, (0.0, 0.0, turn_sigma / ARCSEC)),
+        **calibration,
     )
-    tilt = replace(field.tilt(), temperature_c=mounting.get("warm", 20.0))
-    return field.solve(xy, places, STATE, mounting=told, tilt=tilt)
+    told = replace(field.instrument(), calibration=known, inclinometer=errors)
+    return field.solve(xy, places, STATE, instrument=told, tilt=replace(field.tilt(), temperature_c=20.0))
 
 
 def sigma_m(fix, name) -> np.ndarray:
@@ -69,10 +64,10 @@ def test_each_term_says_whether_gnss_replaces_it(rng):
 
 
 def test_drift_grows_with_the_root_of_the_hours(rng):
-    errors = replace(EXACT, drift_rad_per_sqrt_hour=2 * ARCSEC)
+    errors = replace(QUIET, drift_rad_per_sqrt_hour=2 * ARCSEC)
     field = SkyField(altitude=89.9)
     for hours in (1.0, 16.0, 240.0, -16.0):
-        fix = fixed(field, rng, errors, calibrated_unix_s=UTC - 3600 * hours)
+        fix = fixed(field, rng, errors, utc_unix_s=UTC - 3600 * hours)
         assert sigma_m(fix, "tilt drift") == pytest.approx(
             2 * np.sqrt(abs(hours)) * np.array(ARCSEC_M), rel=0.01
         )
@@ -81,10 +76,10 @@ def test_drift_grows_with_the_root_of_the_hours(rng):
 
 
 def test_temperature_by_the_degree(rng):
-    errors = replace(EXACT, temperature_rad_per_c=3 * ARCSEC)
+    errors = replace(QUIET, temperature_rad_per_c=3 * ARCSEC)
     field = SkyField(altitude=89.9)
     for told, warmer in ((10.0, 10.0), (25.0, -5.0), (20.0, 0.0)):
-        fix = fixed(field, rng, errors, calibrated_temperature_c=told)
+        fix = fixed(field, rng, errors, temperature_c=told)
         assert sigma_m(fix, "tilt temperature") == pytest.approx(
             3 * abs(warmer) * np.array(ARCSEC_M), rel=0.01
         )
@@ -93,19 +88,17 @@ def test_temperature_by_the_degree(rng):
 
 def test_scale_counts_from_the_tilt_it_was_calibrated_at(rng):
     """1e-4 of 10 deg is 3.6 arcsec, 111 m."""
-    errors = replace(EXACT, scale=1e-4)
+    errors = replace(QUIET, scale=1e-4)
     # Leans to the north, about the camera's x axis alone.
     field = SkyField(azimuth=0.0, altitude=80.0, roll=0.0)
     fix = fixed(field, rng, errors)
     east, north = sigma_m(fix, "tilt response")
     assert north == pytest.approx(3.6 * ARCSEC_M[1], rel=0.01)
     assert east < 0.5
-    at = field.tilt()
-    assert (
-        sigma_m(fixed(field, rng, errors, calibrated_tilt=(at.theta_x, at.theta_y)), "tilt response").max()
-        < 1e-6
-    )
-    half = fixed(field, rng, errors, calibrated_tilt=(at.theta_x / 2, at.theta_y / 2))
+    lean_deg = np.degrees(field.tilt().theta)
+    there = fixed(field, rng, errors, tilt_deg=tuple(lean_deg))
+    assert sigma_m(there, "tilt response").max() < 1e-6
+    half = fixed(field, rng, errors, tilt_deg=tuple(lean_deg / 2))
     assert sigma_m(half, "tilt response")[1] == pytest.approx(1.8 * ARCSEC_M[1], rel=0.02)
 
 

@@ -10,12 +10,10 @@ from starpos._numeric.roots import symmetric_root
 from starpos.earth.orientation import station_velocity
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
 from starpos.fix._adjustment import gain_of, spread
-from starpos.fix._scatter import extra_variance
+from starpos.fix._scatter import distances2
 from starpos.fix.star_fit import (
-    GOOD_EXTRA,
-    MIN_EXTRA,
+    OUTLIER_SIGMA,
     adjustment_of,
-    distance2,
     expected_extra,
     fitted,
     judged,
@@ -150,10 +148,10 @@ def test_a_root_is_symmetric_and_its_square_is_the_covariance(size, rng):
 
 
 def searched(residual, covariance, share, median_of_chi2):
-    """The variance of `extra_variance`, by plain halving."""
+    """The extra variance of residuals, by plain halving."""
 
     def excess(extra):
-        d2 = distance2(residual, covariance, extra)
+        d2 = distances2(residual, covariance + extra * np.eye(2))
         return (np.median(d2) / median_of_chi2 if median_of_chi2 else d2.mean() / 2) - share
 
     low, high = 0.0, 8 * np.sum(residual**2)
@@ -165,16 +163,22 @@ def searched(residual, covariance, share, median_of_chi2):
     return high
 
 
-@pytest.mark.parametrize("median_of_chi2", [0.0, MEDIAN_OF_CHI2])
 @pytest.mark.parametrize("stars", [3, 4, 21, 88])
-def test_scatter_is_what_halving_finds(stars, median_of_chi2, rng):
+def test_scatter_is_what_halving_finds(stars, rng):
+    """The mean makes the claim, the median the gate, which a star just within it passes."""
     root = rng.normal(0, 0.05, (stars, 2, 2))
-    covariance = root @ root.transpose(0, 2, 1) + 1e-4 * np.eye(2)
+    covariance, every = root @ root.transpose(0, 2, 1) + 1e-4 * np.eye(2), np.ones(stars, bool)
     for scatter in (0.01, 0.1, 3.0):
         residual = rng.normal(0, scatter, (stars, 2))
-        expected = searched(residual, covariance, 0.9, median_of_chi2)
-        found = extra_variance(residual, covariance, 0.9, median_of_chi2, MIN_EXTRA, GOOD_EXTRA)
-        assert found == pytest.approx(expected, rel=1e-3)
+        expected = searched(residual, covariance, 0.9, 0.0)
+        assert judged(residual, covariance, every, 0.9)[0] == pytest.approx(expected, rel=1e-3)
+        # of any size far out: the median stays
+        residual[0] = [1e3, 0.0]
+        typical = searched(residual, covariance, 0.9, MEDIAN_OF_CHI2)
+        unit2 = distances2(np.array([[1.0, 0.0]]), covariance[:1] + typical * np.eye(2))[0]
+        for within in (0.998, 1.002):
+            residual[0, 0] = within * OUTLIER_SIGMA / np.sqrt(unit2)
+            assert judged(residual, covariance, every, 0.9)[1][0] == (within < 1)
 
 
 def test_stars_are_judged_by_those_that_are_kept(rng):
@@ -244,7 +248,7 @@ def test_arrays_that_do_not_fit_to_each_other_are_refused(rng):
         lambda: gain_of(slope, covariance[1:]),
         lambda: spread(gain_of(slope, covariance), covariance[:1]),
         lambda: judged(problem.xy, covariance[1:], keep, 0.9),
-        lambda: distance2(problem.xy, covariance[1:]),
+        lambda: distances2(problem.xy, covariance[1:]),
         lambda: expected_extra(problem.xy[:, :1], covariance, 0.9),
         lambda: symmetric_root(np.ones((2, 3))),
     ):

@@ -13,7 +13,6 @@ from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.mounting import Mounting
 from starpos.units import ARCSEC
 from starpos_testing.skies.fields import PAPER, UTC, SkyField, random_field
 
@@ -77,7 +76,7 @@ def test_the_attitude_is_that_of_the_link(rng):
         xy,
         places,
         STATE,
-        mounting=Mounting(a3=field.a3, link_to_camera=link, calibration_covariance=np.zeros((3, 3))),
+        instrument=replace(field.instrument(), link_to_camera=link),
     )
     np.testing.assert_allclose(turned.link_to_enu, field.attitude @ link, atol=1e-10)
     forward = turned.link_to_enu[:, 0]
@@ -259,7 +258,7 @@ def drawn(
         covariance_px2=np.eye(2)[None].repeat(len(xy), 0) * max(centroid, 1e-4) ** 2,
         place_sigma=np.full(len(xy), place * ARCSEC),
         tilt=Tilt(*reading, np.eye(2) * (tilt * ARCSEC) ** 2, utc_unix_s=field.utc),
-        mounting=replace(field.mounting(calibration), remounted_rad=remounting * ARCSEC),
+        instrument=field.instrument(calibration, remounting),
         atmosphere=air,
         clock_stddev_s=clock,
         stamp_stddev_s=stamp,
@@ -309,7 +308,7 @@ def test_errors_are_as_large_as_their_covariance_says(source, rng):
         all_three = np.array([*moved, turned]) / unit
         together.append(all_three @ np.linalg.solve(c / np.outer(unit, unit), all_three))
         spin = rotation.to_small_vector(
-            fix.link_to_enu @ (field.attitude @ np.array(field.mounting().link_to_camera)).T
+            fix.link_to_enu @ (field.attitude @ np.array(field.instrument().link_to_camera)).T
         )
         attitude.append(np.sum(spin**2) / np.trace(fix.link.covariance))
     bound = 4 * np.sqrt(2 / tries)

@@ -114,7 +114,7 @@ def test_a3_by_turning_and_at_a_known_place(catalogue):
     turned = turn(unknown, night.pointings, night.tilt)
     assert night.place_nees(average(turned.fixes)) < 14
     known = calibrate_at(unknown, night.pointings, night.tilt, night.site.place)
-    up = known.instrument.mounting.calibrated_up
+    up = known.instrument.calibration.up
     off = (known.instrument.calibration.a3 - TRUE_A3).T @ up
     assert np.linalg.norm(off) / ARCSEC < 4 * known.plumb_stddev_arcsec
 

@@ -7,7 +7,7 @@ from starpos import rotation
 from starpos.errors import TiltError, TiltRangeError
 from starpos.instrument import sensors
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt, level_of, up_of, up_slope
-from starpos.instrument.mounting import LocalLevel
+from starpos.instrument.instrument import LocalLevel
 
 DEG = np.pi / 180
 NO_ERROR = np.zeros((2, 2))

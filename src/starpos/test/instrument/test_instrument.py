@@ -27,7 +27,7 @@ def test_misalignment_is_r3_r2_r1():
 
 
 def test_the_link_looks_along_the_top_of_the_frame():
-    link = Instrument(1.0).mounting.link_to_camera
+    link = np.array(Instrument(1.0).link_to_camera)
     np.testing.assert_array_equal(link @ [1, 0, 0], [0, -1, 0])
     np.testing.assert_array_equal(link @ [0, 0, 1], [0, 0, 1])
     assert np.linalg.det(link) == pytest.approx(1)
@@ -38,6 +38,13 @@ def test_intrinsics_of_another_frame_size():
     assert Instrument(5200.5, camera=camera).camera_for(1392, 1040) is camera
     with pytest.raises(InstrumentError, match="1392 x 1040"):
         Instrument(5200.5, camera=camera).camera_for(1392, 1041)
+
+
+@pytest.mark.parametrize("ry", [-90.0, -89.9999999, 30.0, 90.0])
+def test_angles_hold_a3_where_its_x_axis_is_the_cameras_z(ry, rng):
+    """At 90 deg two of the three angles are about one axis, and the sine of the third shows only half of the digits."""
+    a3 = Calibration(misalignment_deg=(20.0, ry, -130.0)).a3 @ rotation.from_vector(rng.normal(0, 1e-16, 3))
+    np.testing.assert_allclose(Calibration().turned_to(a3).a3, a3, atol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -63,9 +63,9 @@ def test_every_key(reads):
     assert i.inclinometer.noise_rad == pytest.approx(np.radians(0.002))
     assert i.clock_stddev_s == 0.001
     np.testing.assert_allclose(
-        np.sqrt(np.diag(i.mounting.calibration_covariance)), np.radians([1 / 3600, 2 / 3600, 3 / 3600])
+        np.sqrt(np.diag(i.calibration.covariance)), np.radians([1 / 3600, 2 / 3600, 3 / 3600])
     )
-    np.testing.assert_array_equal(i.mounting.link_to_camera, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    np.testing.assert_array_equal(i.link_to_camera, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 
 
 def test_the_camera_of_a_calibration_file_beside_it_or_elsewhere(reads, tmp_path):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from starpos import rotation
 from starpos.averaging import elevation_axis
 from starpos.fix.solver import Solver
 from starpos.instrument.instrument import UNKNOWN_ARCSEC, Calibration
@@ -79,6 +80,6 @@ def test_an_axis_that_the_fit_leaves_at_the_border_of_what_the_frames_can_have_i
     answered(night, off_deg=-1.0, stated=UNKNOWN_ARCSEC)
     a3, _, circles, _, ray, _ = first = calls[0]
     up = np.array([c.up for c in circles])
-    begin, end = (np.sin(elevation_axis._seen(up, m @ ray)).min() for m in (a3, solved(*first).a3))
+    begin, end = (np.sin(rotation.angle(up, m @ ray)).min() for m in (a3, solved(*first).a3))
     monkeypatch.setattr(elevation_axis, "MIN_SINE", begin + 0.01 * (end - begin))
     assert end < begin and solved(*first) is None

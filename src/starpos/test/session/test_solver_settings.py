@@ -39,7 +39,7 @@ def test_unset_air_widens_the_refraction_and_measured_air_does_not():
 def test_the_cameras_intrinsics_come_from_camera_info():
     instrument = instrument_of(misalignment=(0.1, 0.2, 0.3), misalignment_stddev=7.0)
     assert instrument.camera is CAMERA
-    sigma = np.sqrt(np.diag(instrument.mounting.calibration_covariance))
+    sigma = np.sqrt(np.diag(instrument.calibration.covariance))
     assert sigma == pytest.approx(np.radians(7.0 / 3600))
 
 

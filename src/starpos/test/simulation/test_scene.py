@@ -42,7 +42,7 @@ def test_tilt_is_what_turns_the_frame_level(rng):
             pointing_deg=(float(rng.uniform(0, 360)), float(rng.uniform(66, 90)), float(rng.uniform(0, 360))),
             misalignment_deg=tuple(rng.uniform(-3, 3, 3).tolist()),
         )
-        up = level_of(up_of(scene.tilt)) @ scene.instrument.mounting.a3 @ scene.attitude[2]
+        up = level_of(up_of(scene.tilt)) @ scene.instrument.calibration.a3 @ scene.attitude[2]
         np.testing.assert_allclose(up, [0, 0, 1], atol=1e-14)
 
 

@@ -13,16 +13,16 @@ from starpos.fix.budget import Circumstances
 from starpos.fix.fix import Fix, solve_fix
 from starpos.fix.star_fit import MatchedStars
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.instrument import TOP_OF_FRAME
-from starpos.instrument.mounting import Mounting
+from starpos.instrument.inclinometer import EXACT, Tilt
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos.sky.site import Site, camera_to_enu
-from starpos.units import ARCSEC
 
 # 2026-11-02T18:00:00
 UTC = 1793642400.0
 PAPER = Camera.from_focal(5616, 3744, 93750.0)
 NO_ERROR = np.zeros((2, 2))
+# an instrument refuses a noise of 0
+QUIET = replace(EXACT, noise_rad=1e-15)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +54,7 @@ class SkyField:
 
     @property
     def a3(self) -> np.ndarray:
-        rx, ry, rz = np.radians(self.misalignment)
-        return rotation.about_axis(2, rz) @ rotation.about_axis(1, ry) @ rotation.about_axis(0, rx)
+        return self.instrument().calibration.a3
 
     @property
     def heading(self) -> float:
@@ -80,13 +79,10 @@ class SkyField:
         seen = self.air.refraction().bend(v / np.linalg.norm(v, axis=1, keepdims=True) @ site.enu.T)
         return self.camera.project(seen @ self.attitude), icrs
 
-    def mounting(self, calibration=0.0) -> Mounting:
-        """The mounting, with a calibration error in arcsec per axis, 1 sigma."""
-        return Mounting(
-            a3=self.a3,
-            link_to_camera=np.array(TOP_OF_FRAME),
-            calibration_covariance=np.eye(3) * (calibration * ARCSEC) ** 2,
-        )
+    def instrument(self, calibration=0.0, remounting=0.0) -> Instrument:
+        """The instrument, with errors of its calibration and of a remounting in arcsec per axis, 1 sigma."""
+        known = replace(Calibration.of(self.misalignment, (calibration,) * 3), remounted_arcsec=remounting)
+        return Instrument(self.camera.fx, calibration=known, inclinometer=QUIET)
 
     def solve(self, xy, places, state=None, **given) -> Fix:
         """Call solve_fix with the truth of this field; `given` replaces parts of it."""
@@ -96,7 +92,7 @@ class SkyField:
         tilt = given.pop("tilt", None) or self.tilt()
         about = Circumstances(
             camera=self.camera,
-            mounting=self.mounting(),
+            instrument=self.instrument(),
             atmosphere=self.air,
             earth=state or earth_state(self.utc),
             clock_stddev_s=0.0,

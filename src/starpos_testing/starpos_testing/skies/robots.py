@@ -73,7 +73,7 @@ def _frames(robot, compressed, rng):
 
 
 def _readings(robot, rng):
-    up = robot.instrument.mounting.a3 @ robot.attitude[2]
+    up = robot.instrument.calibration.a3 @ robot.attitude[2]
     for n in range(round((FRAMES * CADENCE_S + 2.0) * IMU_HZ)):
         at_s = START_S + n / IMU_HZ
         x, y, z = (9.81 * up + rng.normal(0, IMU_NOISE, 3)).tolist()
