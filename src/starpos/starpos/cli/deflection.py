@@ -9,14 +9,15 @@ import numpy as np
 
 from starpos.cli import console, inputs, options
 from starpos.earth.place import Place
+from starpos.earth.vertical import Deflection
 from starpos.errors import FixError, FrameError, InstrumentError, TiltError
 from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.solution import Solution
 from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilt_log import TiltsByTime
 from starpos.night.at_mark import zenith_seen
-from starpos.night.bag import each_frame, is_bag
+from starpos.night.bag import is_bag
 from starpos.night.opening import work_of
-from starpos.night.work import Solving
 from starpos.units import ARCSEC, utc_text
 from starpos.zenith.adjustment import DeflectionSession, FaceQuality, reduced
 from starpos.zenith.doubts import checked_session, remarks
@@ -123,8 +124,8 @@ def run(args: argparse.Namespace) -> int:
     return _tell(args, _of_bag(args, mark) if _is_bag(args) else _of_files(args, mark), mark)
 
 
-# names of a session's frames, their sightings or the errors, and the instrument
-_Taken = tuple[list[str], list[ZenithSighting | Solution | FrameError], Instrument]
+# a session's frames, each by name with its sighting or why it has none; the instrument
+_Taken = tuple[list[tuple[str, ZenithSighting | Solution | FrameError]], Instrument]
 
 
 def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
@@ -144,7 +145,7 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
     assert instrument is not None
     inputs.prepare(instrument, about)
     work = partial(read.on, partial(zenith_seen, given, mark))
-    return frames, list(inputs.worked(args, work, frames, lines=False)), instrument
+    return list(zip(frames, inputs.worked(args, work, frames, lines=False), strict=True)), instrument
 
 
 def _is_bag(args: argparse.Namespace) -> bool:
@@ -158,31 +159,25 @@ def _is_bag(args: argparse.Namespace) -> bool:
 
 def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
     """The sightings of a bag's frames."""
-    path = Path(args.frames[0])
-    found, instruments = inputs.read_bag(path, args)
-    console.complain(*found.remarks)
-    if found.tilts is None:
-        raise TiltError(f"{path}: no usable tilt in it: record the topic tilt too")
-    if not found.star_count:
-        raise FrameError(f"{path}: no stars and no images in it: record the topic stars too")
-    given = Solving(instruments, atmosphere=options.atmosphere_of(args), tilts=found.tilts)
-    names, answers = [], []
-    for name, item in inputs.watched(each_frame(found), found.star_count, lines=False):
-        names.append(name)
-        answers.append(item if isinstance(item, FrameError) else zenith_seen(given, mark, item))
-    assert instruments.instrument is not None
-    return names, answers, instruments.instrument
+    night = inputs.bag_of(Path(args.frames[0]), args, Deflection())
+    console.complain(*night.remarks)
+    if isinstance(night.work.tilts, TiltsByTime):
+        raise TiltError(night.work.tilts.why)
+    if not night.count:
+        raise FrameError(f"{args.frames[0]}: no stars and no images in it: record the topic stars too")
+    answers = night.each(partial(zenith_seen, night.work, mark))
+    assert night.work.instruments.instrument is not None
+    return list(inputs.watched(answers, night.count, lines=False)), night.work.instruments.instrument
 
 
 def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
     """Adjust the session and print it; returns the exit status."""
-    output, (names, answers, instrument) = console.Output(args, "deflection"), taken
+    output, (rows, instrument) = console.Output(args, "deflection"), taken
     console.complain(unnamed_inclinometer(instrument))
-    rows = list(zip(names, answers, strict=True))
     for name, answer in rows:
         if not isinstance(answer, ZenithSighting):
             console.complain(_why(name, answer))
-    sightings = [answer for answer in answers if isinstance(answer, ZenithSighting)]
+    sightings = [answer for _, answer in rows if isinstance(answer, ZenithSighting)]
     try:
         session = checked_session(sightings, instrument, options.atmosphere_of(args), mark)
     except FixError as error:
@@ -199,7 +194,7 @@ def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
     without = reduced(session, mark)
     whole = combined_json(session, without, mark, args.station)
     output.put(whole, combined_text(session, whole))
-    return console.UNREADABLE if any(isinstance(a, FrameError) for a in answers) else 0
+    return console.UNREADABLE if any(isinstance(a, FrameError) for _, a in rows) else 0
 
 
 def _mark_of(args: argparse.Namespace) -> Place:

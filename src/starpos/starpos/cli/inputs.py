@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from starpos.cli import console, options
 from starpos.earth.place import Place
+from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.searching import Sight
@@ -32,7 +33,7 @@ from starpos.parallel.processes import Workers, memory_bytes, processors, worker
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:
-    from starpos.night.bag import Recorded
+    from starpos.night.solving import Exposures
 
 
 def reader_of(args: argparse.Namespace, by_files: bool = False) -> Reader:
@@ -208,8 +209,8 @@ def _night(folder: str) -> NightFolder | FrameError:
 PIP = "pip install matplotlib rosbags"
 
 
-def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instruments]":
-    """One instrument's part of a bag, and the instrument of its frames; raises StarposError."""
+def bag_of(path: Path, args: argparse.Namespace, vertical: Vertical) -> "Exposures":
+    """One instrument's part of a bag, to be solved; raises StarposError."""
     if find_spec("rosbags") is None:
         raise FrameError(f"{path}: bags are read with rosbags, which is not here: {PIP}")
     from starpos.night import bag
@@ -217,11 +218,17 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
     from starpos.recording.topics import remaps_of
 
     any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
-    drivers = Drivers.of(args.params_file, args.param, args.namespace, remaps_of(args.remap))
-    found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, drivers, console.ProgressBar())
     told = (args.instrument, args.focal_mm) != (None, None)
-    cameras = found.cameras if args.focal_mm is None else {}
-    return found, Instruments(any_camera, cameras=cameras, any_size=told)
+    return bag.exposures(
+        path,
+        args.namespace,
+        Drivers.of(args.params_file, args.param, args.namespace, remaps_of(args.remap)),
+        Instruments(any_camera, any_size=told),
+        options.atmosphere_of(args),
+        vertical,
+        console.ProgressBar(),
+        own_cameras=args.focal_mm is None,
+    )
 
 
 # Frames of a picture's size that are worth the start of a process, which takes a second of CPU time; and its memory.

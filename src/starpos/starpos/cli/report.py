@@ -125,13 +125,13 @@ def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
     """The exposures of a folder, of photographs or of a bag; raises StarposError without any."""
     from starpos.night import bag
 
-    air, vertical, path = options.atmosphere_of(args), options.vertical_of(args), paths[0]
+    vertical, path = options.vertical_of(args), paths[0]
     if not path.exists():
         raise FrameError(f"{path}: there is no such night: give a folder, a rosbag2, or photographs")
     if bag.is_bag(path):
         if args.gnss is not None:
             raise FrameError(f"{path}: --gnss goes with a folder of frames, and this is a bag: leave it out")
-        return bag.exposures(*inputs.read_bag(path, args), air, vertical)
+        return inputs.bag_of(path, args, vertical)
     frames = paths if path.is_file() else []
     if frames and not are_photographs(frames):
         raise FrameError(
@@ -142,4 +142,5 @@ def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
     # a field report states the focal length
     find = inputs.given_or_sought if args.field is None else inputs.given_of
     given = Instruments(None) if about is None else find(args, about)
+    air = options.atmosphere_of(args)
     return exposures(folder, given, air, vertical, read=read, frames=frames)
