@@ -10,7 +10,6 @@ from starpos.cli.inputs import near_of
 from starpos.errors import InstrumentError, StarposError
 from starpos.fix.circle import Circle
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
-from starpos.night.remarks import doubts, of_average
 from starpos.night.together import Together
 from starpos.sky.catalogue import load_catalogue
 
@@ -35,8 +34,7 @@ def run(args: argparse.Namespace) -> int:
     if sound:
         try:
             used, seen = zip(*sound, strict=True)
-            place = place_of_sights(used, seen, None if near is None else (near.latitude, near.longitude))
-            whole = Together(place, "", (*of_average(place), *doubts((), place, None, near)))
+            whole = Together.by_circles(place_of_sights(used, seen, near and near.place), near)
         except StarposError as error:
             whole = Together(None, str(error))
     return tell_elevations(args, output, sights, circles, whole, vertical, near)

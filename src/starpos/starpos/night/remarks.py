@@ -221,9 +221,14 @@ class Near:
     stated_by: str = "--near"
     either_sign: bool = False
 
+    @property
+    def place(self) -> tuple[float, float]:
+        """Latitude and longitude in rad."""
+        return self.latitude, self.longitude
+
     def km_from(self, latitude: float, longitude: float) -> float:
         """Distance in km, on a sphere, to a place in rad."""
-        return apart_m((self.latitude, self.longitude), (latitude, longitude)) / 1000
+        return apart_m(self.place, (latitude, longitude)) / 1000
 
 
 def doubts(
@@ -304,12 +309,8 @@ def _places(
     for name, corrected in MISTAKES:
         angles = corrected(theta)
         if np.abs(angles).max() < np.pi / 2:
-            found.append(
-                (
-                    name,
-                    [_place(camera, one, mounting) for (camera, _), one in zip(frames, angles, strict=True)],
-                )
-            )
+            places = [_place(camera, one, mounting) for (camera, _), one in zip(frames, angles, strict=True)]
+            found.append((name, places))
     return found
 
 

@@ -153,24 +153,23 @@ def _without_lamps(answers: Iterable[FrameAnswer]) -> Iterator[FrameAnswer]:
     proven = False
     for answer in answers:
         glow = answer.solution.glow
-        if glow is None:
-            held.append(answer)
-        else:
-            before = [a.solution.glow for a in held if a.solution.glow is not None]
-            first = lamp or next(iter(before), None)
-            stood = [g.stood_still(glow) for g in ([first, *before[-1:]] if first else [])]
-            still = next((s for s in stood if s is not None), None)
-            if still and first is not None:
-                lamp = first
-                answer = replace(answer, solution=answer.solution.as_lamp(first.utc_unix_s))
-                held = [replace(a, solution=a.solution.as_lamp(glow.utc_unix_s)) for a in held]
-            elif still is False:
-                yield from held
-                held, lamp, proven = [], None, True
-            held.append(answer)
-        if lamp is not None or all(a.solution.glow is None for a in held):
-            yield from held
+        before = [a.solution.glow for a in held if a.solution.glow is not None]
+        first = lamp or next(iter(before), None)
+        stood = [] if glow is None or first is None else [g.stood_still(glow) for g in (first, *before[-1:])]
+        still = next((s for s in stood if s is not None), None)
+        if still and glow is not None and first is not None:
+            lamp = first
+            for a in held:
+                yield replace(a, solution=a.solution.as_lamp(glow.utc_unix_s))
             held = []
+            yield replace(answer, solution=answer.solution.as_lamp(first.utc_unix_s))
+        elif still is False:
+            yield from held
+            held, lamp, proven = [answer], None, True
+        elif glow is None and not held:
+            yield answer
+        else:
+            held.append(answer)
     for answer in held:
         yield replace(answer, solution=answer.solution if proven else answer.solution.unproven())
 

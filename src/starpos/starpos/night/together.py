@@ -110,6 +110,12 @@ class Together:
     why_not: str = ""
     remarks: tuple[str, ...] = ()
 
+    @classmethod
+    def by_circles(cls, place: Average, near: Near | None) -> "Together":
+        """The place where circles meet, and what looks wrong with it."""
+        said = *remarks.of_average(place), *doubts((), place, None, near)
+        return cls(place, "", tuple(filter(None, said)))
+
 
 def together(gathered: Gathered, given: Instrument | None, near: Near | None = None) -> Together:
     """Average the fixes of a night, and check them; of a day, find where the Sun's circles meet.
@@ -150,11 +156,10 @@ def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
                 "the Sun's elevations determine a place only where A3 is known to 6 arcmin: find it by night with "
                 "starpos calibrate --site"
             )
-        place, _ = place_of_discs(circles, None if near is None else (near.latitude, near.longitude))
+        place, _ = place_of_discs(circles, near and near.place)
     except FixError as error:
         return Together(None, str(error))
-    said = *remarks.of_average(place), *doubts((), place, None, near)
-    return Together(place, "", tuple(filter(None, said)))
+    return Together.by_circles(place, near)
 
 
 @dataclass(frozen=True)
@@ -230,7 +235,7 @@ def from_elevations(
     sound = [c for c in circles if isinstance(c, Circle)]
     if not sound:
         return Elevations(tuple(circles), Together())
-    there, axis = None if near is None else (near.latitude, near.longitude), None
+    there, axis = near and near.place, None
     try:
         directions = Directions.of(sorted(sound, key=lambda c: c.utc_unix_s))
         if self_calibrate or (directions.wide and len(directions.circles) >= MIN_WITHOUT_SITE):
