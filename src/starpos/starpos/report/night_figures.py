@@ -10,7 +10,7 @@ import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.place import Place
-from starpos.fix.fix import PlaceFix
+from starpos.fix.fix import PlaceFix, frame_to_icrs
 from starpos.fix.solution import FieldPointing
 from starpos.gnss.solving import Watched
 from starpos.gnss.watch import GnssStatus
@@ -214,7 +214,7 @@ def draw_health(figure: "Figure", night: Night) -> None:
     shots = night.shots
     at, label = _times(shots)
     panels = figure.subplots(4, 1, sharex=True)
-    mark, size = ("o", 3.5) if len(shots) <= 150 else (".", 2.5)
+    mark, size = ("o", 3.5) if len(shots) <= MANY else (".", 2.5)
     points: dict[str, Any] = {"ms": size, "ls": "none", "marker": mark}
     panels[0].plot(
         at,
@@ -293,19 +293,18 @@ COLOURS = {
 }
 
 
-def compared_of(answers: Sequence[Watched]) -> list[Watched]:
-    """The answers to frames with a GNSS place, in the order of their times."""
-    timed = [a for a in answers if a.compared is not None and a.solution.utc_unix_s is not None]
-    return sorted(timed, key=lambda a: a.solution.utc_unix_s or 0.0)
+def timed_of(answers: Sequence[Watched]) -> list[Watched]:
+    """The answers to frames whose time is known, in its order."""
+    return sorted((a for a in answers if a.solution.utc_unix_s is not None), key=_time_of)
 
 
-def draw_drive(figure: "Figure", answers: Sequence[Watched]) -> None:
-    """Draw both places on a map, their distance over time, and what was learned over time."""
-    timed = sorted(
-        (a for a in answers if a.solution.utc_unix_s is not None), key=lambda a: a.solution.utc_unix_s or 0.0
-    )
-    begin_s = timed[0].solution.utc_unix_s or 0.0
-    hours = np.array([((a.solution.utc_unix_s or 0.0) - begin_s) / HOUR_S for a in timed])
+def _time_of(answer: Watched) -> float:
+    return answer.solution.utc_unix_s or 0.0
+
+
+def draw_drive(figure: "Figure", timed: Sequence[Watched]) -> None:
+    """Draw both places of `timed_of` answers on a map, their distance over time, and what was learned over time."""
+    hours = np.array([(_time_of(a) - _time_of(timed[0])) / HOUR_S for a in timed])
     above, middle, below = figure.subplots(3, 1, height_ratios=(2.2, 1.1, 1.1))
     _draw_map(above, timed)
     _draw_distance(middle, hours, timed)
@@ -473,11 +472,8 @@ def polar(enu: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _axes(a: FieldPointing) -> np.ndarray:
     """Camera axes (3, 3) in ICRS: its rows are x (along columns), y (along rows) and z."""
-    ca, sa, cd, sd = np.cos(a.ra), np.sin(a.ra), np.cos(a.dec), np.sin(a.dec)
-    east, north = np.array([-sa, ca, 0.0]), np.array([-sd * ca, -sd * sa, cd])
-    cr, sr = np.cos(a.roll), np.sin(a.roll)
-    x = sr * north - cr * east
-    return np.stack([-x if a.mirrored else x, -(cr * north + sr * east), [cd * ca, cd * sa, sd]])
+    axes = frame_to_icrs(a.ra, a.dec, a.roll).T
+    return axes * [[-1], [1], [1]] if a.mirrored else axes
 
 
 def _outline(view: View) -> np.ndarray:

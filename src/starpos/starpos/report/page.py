@@ -70,9 +70,9 @@ def _figures(night: Night, catalogue: Catalogue) -> Iterator[_Figure]:
             yield "sky", draw.OUTLINES, lambda f: draw.draw_sky(f, night, catalogue)
     if not night.shots:
         return
-    if night.watched is not None and draw.compared_of(night.watched.answers):
-        answers = night.watched.answers
-        yield "drive", _alarm_told(answers), lambda f: draw.draw_drive(f, answers)
+    timed = [] if night.watched is None else draw.timed_of(night.watched.answers)
+    if any(a.compared is not None for a in timed):
+        yield "drive", _alarm_told(timed), lambda f: draw.draw_drive(f, timed)
     yield "health", "", lambda f: draw.draw_health(f, night)
 
 
@@ -92,9 +92,8 @@ def _place_figures(night: Night) -> Iterator[_Figure]:
         yield "budget", "", lambda f: draw.draw_budget(f, night)
 
 
-def _alarm_told(answers: Sequence[Watched]) -> str:
-    compared = night_figures.compared_of(answers)
-    alarm = next((a for a in compared if a.compared and a.compared.status == GnssStatus.DISAGREES), None)
+def _alarm_told(timed: Sequence[Watched]) -> str:
+    alarm = next((a for a in timed if a.compared and a.compared.status == GnssStatus.DISAGREES), None)
     if alarm is None or alarm.compared is None:
         return "No alarm: GNSS never disagreed."
     return f"Alarm at {utc_text(alarm.solution.utc_unix_s or 0.0)}: {alarm.compared.sentence}."
