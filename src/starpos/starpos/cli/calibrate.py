@@ -26,7 +26,7 @@ from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn, unnamed_inc
 from starpos.fix.heading import confirms_hour
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
-from starpos.frames.frame import Frame, Stars
+from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
 from starpos.frames.tables import TILTS, Pointing, read_pointings
 from starpos.instrument import instrument_file, platepar
@@ -35,12 +35,11 @@ from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import SAG_ARCSEC_PER_SQRT_HOUR, Calibration, Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.night import horizon
-from starpos.night.extinction import light_of
 from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, Instruments, Reader
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_left_out
 from starpos.night.together import axis_of, circles_of
-from starpos.night.watching import Answer, kept, night_poses, sky_mag
+from starpos.night.watching import Answer, kept, night_poses
 from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import ARCSEC
@@ -278,16 +277,10 @@ def _watch(args: argparse.Namespace) -> int:
     overwriting.check(args, page=overwriting.ours, horizon=overwriting.never)
     site = options.camera_place_of(args)
     answers, stars = [], []
-    for item, sight, camera in inputs.seen_at(args, site):
-        found = sight.solution
-        assert found.at_place is not None
-        sky = sky_mag(item, sight.stars, found, camera) if isinstance(item, Frame) else np.nan
-        light, number = light_of(sight.stars, found, camera), len(found.names)
-        answers.append(
-            Answer(at_place=found.at_place, stars=number, focal_px=camera.fx, light=light, sky_mag=sky)
-        )
+    for seen in inputs.seen_at(args, site):
+        answers.append(Answer.of(seen.item, seen.sight, seen.camera))
         if args.horizon is not None:
-            stars.append(horizon.expected(sight, camera, catalogue.load_catalogue()))
+            stars.append(horizon.expected(seen.sight, seen.camera, catalogue.load_catalogue()))
     nights = kept(night_poses(answers, site.longitude))
     for k, night in enumerate(nights):
         values = watch_output.values_of(night)

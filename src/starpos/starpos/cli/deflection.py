@@ -14,7 +14,7 @@ from starpos.errors import FixError, FrameError, InstrumentError, TiltError
 from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.solution import Solution
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.tilt_log import TiltsByTime
+from starpos.instrument.tilt_log import TiltLog
 from starpos.night.at_mark import zenith_seen
 from starpos.night.bag import is_bag
 from starpos.night.opening import work_of
@@ -159,12 +159,13 @@ def _is_bag(args: argparse.Namespace) -> bool:
 
 def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
     """The sightings of a bag's frames."""
-    night = inputs.bag_of(Path(args.frames[0]), args, Deflection())
+    path = Path(args.frames[0])
+    night = inputs.bag_of(path, args, Deflection())
     console.complain(*night.remarks)
-    if isinstance(night.work.tilts, TiltsByTime):
-        raise TiltError(night.work.tilts.why)
+    if not isinstance(night.work.tilts, TiltLog):
+        raise TiltError(f"{path}: no usable tilt in it: record the topic tilt too")
     if not night.count:
-        raise FrameError(f"{args.frames[0]}: no stars and no images in it: record the topic stars too")
+        raise FrameError(f"{path}: no stars and no images in it: record the topic stars too")
     answers = night.each(partial(zenith_seen, night.work, mark))
     assert night.work.instruments.instrument is not None
     return list(inputs.watched(answers, night.count, lines=False)), night.work.instruments.instrument

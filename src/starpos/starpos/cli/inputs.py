@@ -17,6 +17,7 @@ from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.blind import BlindSolver
+from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.searching import Sight
 from starpos.fix.solver import Solver
 from starpos.frames.exif import CameraClock
@@ -68,8 +69,18 @@ def is_untold(args: argparse.Namespace) -> bool:
     return (args.instrument, args.focal_mm, args.pixel_um) == (None,) * 3 and args.lens == PLUMB_BOB
 
 
-def seen_at(args: argparse.Namespace, place: Place) -> Iterator[tuple[Frame | Stars, Sight, Camera]]:
-    """Frames with their attitudes at a place, and the camera with the focal length that their stars show.
+@dataclass(frozen=True)
+class Seen:
+    """A frame whose attitude at a known place is known, and its camera with the focal length that its stars show."""
+
+    item: Frame | Stars
+    sight: Sight
+    at_place: AttitudeAtPlace
+    camera: Camera
+
+
+def seen_at(args: argparse.Namespace, place: Place) -> Iterator[Seen]:
+    """Frames with their attitudes at a place.
 
     Frames without an attitude are complained about.  Raises StarposError as `solve` does.
     """
@@ -90,8 +101,8 @@ def seen_at(args: argparse.Namespace, place: Place) -> Iterator[tuple[Frame | St
             console.complain(e)
             continue
         sight = work(item)
-        answer = sight.solution
-        if answer.at_place is None or answer.found is None:
+        answer, at_place = sight.solution, sight.solution.at_place
+        if at_place is None or answer.found is None:
             timed = answer.found is None or item.mid_unix_s
             no_time = f"{item.place}: no time of exposure: {why_no_time(item)}"
             why = answer.message if item.place in answer.message else f"{item.place}: {answer.message}"
@@ -100,7 +111,7 @@ def seen_at(args: argparse.Namespace, place: Place) -> Iterator[tuple[Frame | St
         instrument = sight.instrument or work.instruments.of(item)
         assert instrument is not None
         camera = instrument.camera_for(item.width, item.height, item.origin_px)
-        yield item, sight, camera.scaled(answer.found.focal_scale * answer.at_place.focal_scale)
+        yield Seen(item, sight, at_place, camera.scaled(answer.found.focal_scale * at_place.focal_scale))
 
 
 def identifying(args: argparse.Namespace, frames: Sequence[str], read: Reader, search_s: float) -> Solving:

@@ -26,11 +26,7 @@ def run(args: argparse.Namespace) -> int:
     axes = options.axes_of(args)
     readings = None if args.readings is None else _readings(args.readings)
     place = options.camera_place_of(args)
-    seen = [
-        (sight.stars.source, at)
-        for _, sight, _ in inputs.seen_at(args, place)
-        if (at := sight.solution.at_place) is not None
-    ]
+    seen = [(s.sight.stars.source, s.at_place) for s in inputs.seen_at(args, place)]
     try:
         if readings is None:
             return _axis(args, place, [a for _, a in seen])

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.calibration.plumb_line import huber
-from starpos.fix.solution import Solution
-from starpos.frames.frame import Stars
+from starpos.fix.searching import Sight
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
 from starpos.units import SIGMA_PER_MAD
@@ -44,8 +43,9 @@ def air_mass(altitude_deg: np.ndarray) -> np.ndarray:
     return np.asarray(1 / np.sin(np.radians(h + 244 / (165 + 47 * h**1.1))))
 
 
-def light_of(stars: Stars, solution: Solution, camera: Camera) -> Light:
+def light_of(sight: Sight, camera: Camera) -> Light:
     """The sound identified stars of a frame whose attitude at a known place is known."""
+    stars, solution = sight.stars, sight.solution
     assert solution.at_place is not None and solution.star is not None
     row, v = np.asarray(solution.star, int), np.asarray(solution.magnitudes, float)
     up = camera.directions(stars.x[row], stars.y[row]) @ solution.at_place.optics.rotation[2]

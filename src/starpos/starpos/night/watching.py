@@ -13,11 +13,11 @@ from starpos.averaging.poses import mean_attitude
 from starpos.errors import FixError
 from starpos.fix.attitude import Attitude
 from starpos.fix.heading import AttitudeAtPlace
-from starpos.fix.solution import Solution
+from starpos.fix.searching import Sight
 from starpos.fix.terms import total_covariance
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import EQUIDISTANT, Camera
-from starpos.night.extinction import Light, extinction
+from starpos.night.extinction import Light, extinction, light_of
 from starpos.units import ARCSEC, DAY_S, HOUR_S
 
 # how far an untouched camera may wander from night to night, 1 sigma per axis: from the stiffest mount to a post in the
@@ -105,18 +105,31 @@ class Answer:
     light: Light
     sky_mag: float = np.nan
 
+    @classmethod
+    def of(cls, item: Frame | Stars, sight: Sight, camera: Camera) -> "Answer":
+        """The part of a frame's sight, whose attitude is known."""
+        assert sight.solution.at_place is not None
+        return cls(
+            at_place=sight.solution.at_place,
+            stars=len(sight.solution.names),
+            focal_px=camera.fx,
+            light=light_of(sight, camera),
+            sky_mag=sky_mag(item, sight, camera),
+        )
 
-def sky_mag(frame: Frame, stars: Stars, answer: Solution, camera: Camera) -> float:
+
+def sky_mag(item: Frame | Stars, sight: Sight, camera: Camera) -> float:
     """V of the sky around the optical axis per square arcsec, by the identified stars of a fisheye's frame; else NaN.
 
     The pixels that the lens does not reach are the black level.  A picture of 8 bit has no level that is proportional to
     light.
     """
-    if camera.model != EQUIDISTANT or frame.pixels.dtype != np.uint16 or answer.star is None:
+    stars, answer = sight.stars, sight.solution
+    if isinstance(item, Stars) or camera.model != EQUIDISTANT or item.pixels.dtype != np.uint16:
         return np.nan
-    y, x = np.mgrid[0 : frame.height : SPARSE, 0 : frame.width : SPARSE]
+    y, x = np.mgrid[0 : item.height : SPARSE, 0 : item.width : SPARSE]
     off = np.hypot((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
-    levels = frame.pixels[::SPARSE, ::SPARSE].astype(float)
+    levels = item.pixels[::SPARSE, ::SPARSE].astype(float)
     dark, sky = levels[off > DARK_RAD], levels[off < SKY_RAD]
     row, v = np.asarray(answer.star, int), np.asarray(answer.magnitudes, float)
     good = np.isfinite(v) & (stars.flags[row] == 0)
