@@ -339,14 +339,10 @@ def _from_pointings(args: argparse.Namespace) -> int:
     instrument = options.instrument_of(args, NO_CAMERA)
     check_output(args, instrument)
     tilts = None if args.tilt is None else checked_tilts(args.tilt, instrument).log
-    try:
-        if elevations and tilts is not None:
-            run_elevations(args, elevations, instrument, tilts)
-        else:
-            run_site(args, whole, instrument, tilts)
-    except FixError as e:
-        console.complain(e)
-        return console.NOTHING
+    if elevations and tilts is not None:
+        run_elevations(args, elevations, instrument, tilts)
+    else:
+        run_site(args, whole, instrument, tilts)
     return 0
 
 

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from starpos import cli
 from starpos.files import rows_of
 
 OUTPUTS = Path(__file__).with_name("data") / "outputs.yaml"
-# Exit status: no answer; input that cannot be read.
-NOTHING, UNREADABLE = 1, 2
+NOTHING, UNREADABLE = cli.NOTHING, cli.BAD_CALL
 # s of work that needs no bar
 BAR_AFTER_S = 0.5
 

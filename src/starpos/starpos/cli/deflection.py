@@ -10,7 +10,7 @@ import numpy as np
 from starpos.cli import console, inputs, options
 from starpos.earth.place import Place
 from starpos.earth.vertical import Deflection
-from starpos.errors import FixError, FrameError, InstrumentError, TiltError
+from starpos.errors import FrameError, InstrumentError, TiltError
 from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.solution import Solution
 from starpos.instrument.instrument import Instrument
@@ -179,11 +179,7 @@ def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
         if not isinstance(answer, ZenithSighting):
             console.complain(_why(name, answer))
     sightings = [answer for _, answer in rows if isinstance(answer, ZenithSighting)]
-    try:
-        session = checked_session(sightings, instrument, options.atmosphere_of(args), mark)
-    except FixError as error:
-        console.complain(error)
-        return console.NOTHING
+    session = checked_session(sightings, instrument, options.atmosphere_of(args), mark)
     console.complain(*remarks(session, len(rows), instrument.inclinometer.scale))
     at = {id(s): k for k, s in enumerate(session.sightings)}
     for name, answer in rows:

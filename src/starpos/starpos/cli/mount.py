@@ -27,13 +27,9 @@ def run(args: argparse.Namespace) -> int:
     readings = None if args.readings is None else _readings(args.readings)
     place = options.camera_place_of(args)
     seen = [(s.sight.stars.source, s.at_place) for s in inputs.seen_at(args, place)]
-    try:
-        if readings is None:
-            return _axis(args, place, [a for _, a in seen])
-        return _circle(args, seen, readings, axes[list(axes)[-1]])
-    except FixError as e:
-        console.complain(e)
-        return console.NOTHING
+    if readings is None:
+        return _axis(args, place, [a for _, a in seen])
+    return _circle(args, seen, readings, axes[list(axes)[-1]])
 
 
 def _axis(args: argparse.Namespace, place: Place, seen: Sequence[AttitudeAtPlace]) -> int:

@@ -13,7 +13,7 @@ from starpos.cli import console, inputs, options
 from starpos.cli.fix_output import FIX_KEYS
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Geodetic, Vertical
-from starpos.errors import FixError, VoyageError
+from starpos.errors import VoyageError
 from starpos.instrument.instrument import framed
 from starpos.navigation.estimate import VoyageFix
 from starpos.navigation.voyage import Voyage
@@ -56,11 +56,7 @@ def run(args: argparse.Namespace) -> int:
     frames = under_way.voyage_frames(inputs.worked(args, work, args.frames))
     for frame in frames:
         console.complain(frame.message)
-    try:
-        voyage = under_way.voyage_of(frames, args.imu, args.velocity, vessel, console.ProgressBar())
-    except FixError as error:
-        console.complain(error)
-        return console.NOTHING
+    voyage = under_way.voyage_of(frames, args.imu, args.velocity, vessel, console.ProgressBar())
     return tell(args, frames, voyage, vertical)
 
 

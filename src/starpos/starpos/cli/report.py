@@ -108,8 +108,7 @@ def _pack(args: argparse.Namespace) -> int:
 
     if len(args.nights) > 1:
         raise FrameError("--field packs one night: give one")
-    if not args.field.lower().endswith(field.SUFFIX):
-        raise FrameError(f"--field {args.field}: give it a name that ends in {field.SUFFIX}")
+    field.check_name(args.field)
     count = field.write(Path(args.field), _exposures([Path(args.nights[0])], args), console.ProgressBar())
     print(f"{args.field}: {count} frames")
     return 0

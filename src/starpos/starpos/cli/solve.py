@@ -12,19 +12,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starpos.averaging.elevation_axis import FoundAxis
-from starpos.cli import console, fix_output, inputs, options, overwriting, places_file, sights
+from starpos.averaging.sights import circle_of_sight, place_of_sights, read_sights
+from starpos.cli import console, fix_output, inputs, options, overwriting, places_file
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import InstrumentError, StarposError, TiltError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.checks import unnamed_inclinometer
+from starpos.fix.circle import Circle
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.frames.reading import are_photographs
 from starpos.frames.tables import Pointing, read_pointings
 from starpos.instrument import instrument_file
-from starpos.instrument.instrument import ByGravity, Instrument
+from starpos.instrument.instrument import UNKNOWN_CLOCK_S, ByGravity, Instrument
 from starpos.instrument.phone_log import is_phone_log
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night import field
@@ -32,7 +34,15 @@ from starpos.night.opening import work_of
 from starpos.night.reading import NO_CAMERA, Instruments
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near
 from starpos.night.solving import How, NightAnswers, answers_of
-from starpos.night.together import FrameAnswer, Gathered, TurnedNight, from_elevations, together, turned
+from starpos.night.together import (
+    FrameAnswer,
+    Gathered,
+    Together,
+    TurnedNight,
+    from_elevations,
+    together,
+    turned,
+)
 from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import utc_text
@@ -242,9 +252,35 @@ def _save_axis(args: argparse.Namespace, solver: Solver, axis: FoundAxis | None)
     return 0
 
 
+def _run_sights(args: argparse.Namespace) -> int:
+    """Solve the table of --sights; returns the exit status."""
+    if args.frames:
+        raise InstrumentError("give either frames or --sights CSV, not both")
+    sights, near, vertical = read_sights(args.sights), inputs.near_of(args), options.vertical_of(args)
+    clock_s = UNKNOWN_CLOCK_S if args.clock_stddev is None else args.clock_stddev
+    air = options.atmosphere_of(args)
+    ephemeris = options.ephemeris_of(args)
+    output = console.Output(args, "elevations")
+    circles: list[Circle | StarposError] = []
+    for sight in sights:
+        try:
+            circles.append(circle_of_sight(sight, catalogue.load_catalogue(), air, clock_s, ephemeris))
+        except StarposError as error:
+            circles.append(error)
+    whole = Together()
+    sound = [(s, c) for s, c in zip(sights, circles, strict=True) if isinstance(c, Circle)]
+    if sound:
+        try:
+            used, seen = zip(*sound, strict=True)
+            whole = Together.by_circles(place_of_sights(used, seen, near and near.place), near)
+        except StarposError as error:
+            whole = Together(None, str(error))
+    return fix_output.tell_elevations(args, output, sights, circles, whole, vertical, near)
+
+
 def run(args: argparse.Namespace) -> int:
     if args.sights is not None:
-        return sights.run(args)
+        return _run_sights(args)
     if len(args.frames) == 1 and field.is_field(args.frames[0]):
         return _of_field(args)
     return _run(args)

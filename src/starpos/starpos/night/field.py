@@ -82,6 +82,12 @@ def write(path: Path, exposures: Exposures, progress: Progress = quiet) -> int:
     return sum(name.startswith("stars_") for name in lists)
 
 
+def check_name(path: str) -> None:
+    """Raise FrameError unless the name of --field ends as a field report's does."""
+    if not path.lower().endswith(SUFFIX):
+        raise FrameError(f"--field {path}: give it a name that ends in {SUFFIX}")
+
+
 def is_field(path: Path | str) -> bool:
     """Whether a path looks like a field report."""
     return str(path).lower().endswith(SUFFIX) and Path(path).is_file()

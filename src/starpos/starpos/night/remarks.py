@@ -55,11 +55,8 @@ def of_gravity(instrument: Instrument, by_log: bool = False) -> str:
     return f"the level is {where}; time, zone and lens are the files', and their GPS is only compared"
 
 
-def of_marks(place: Fix | Average, marks_deg: Sequence[tuple[float, float]]) -> str:
-    """Compare a place with the first of those that GPS wrote into the frames' files, deg on WGS 84."""
-    if not marks_deg:
-        return ""
-    mark = Near(*np.radians(marks_deg[0]).tolist())
+def of_mark(place: Fix | Average, mark: "Near") -> str:
+    """Compare a place with the one that GPS wrote into a frame's file, on WGS 84."""
     off = np.array([half_turn(place.longitude - mark.longitude), place.latitude - mark.latitude])
     off *= EARTH_RADIUS_M * np.array([np.cos(mark.latitude), 1.0])
     sigmas = float(np.sqrt(off @ np.linalg.solve(place.covariance[:2, :2], off)))

@@ -17,6 +17,7 @@ from starpos.fix.attitude import heading_of
 from starpos.fix.budget import local_north
 from starpos.fix.glows import Glow
 from starpos.fix.searching import Sight, of_one_camera
+from starpos.fix.solution import Solution
 from starpos.frames.frame import Frame, Stars
 from starpos.identification.prior import Hint
 from starpos.instrument.inclinometer import level_of, up_of
@@ -30,6 +31,7 @@ from starpos.rotation import half_turns
 
 if TYPE_CHECKING:
     from starpos.gnss.receiver import GnssTrack
+    from starpos.gnss.solving import Watched
     from starpos.gnss.states import Learned
     from starpos.night.beside_gnss import WatchedNight
 
@@ -119,15 +121,12 @@ def answers_of(
         from starpos.night.beside_gnss import watched_night
 
         watched = watched_night(solver, alike, asked.tilts, how.gnss, how.learned, vertical)
-        answers = [
-            FrameAnswer("", a.solution, s.stars, a) for a, s in zip(watched.answers, alike, strict=True)
-        ]
-        return NightAnswers(_in_order(rows, answers), solver.instrument, watched=watched)
+        each = _in_order(rows, ((a.solution, a) for a in watched.answers))
+        return NightAnswers(each, solver.instrument, watched=watched)
     assert how.turn_stddev_deg is not None
     found = turned(solver, alike, asked.tilts or NO_TILTS, how.turn_stddev_deg)
-    answers = [FrameAnswer("", a, s.stars) for a, s in zip(found.solutions, alike, strict=True)]
     instrument = solver.instrument if found.calibrated is None else found.calibrated.instrument
-    return NightAnswers(_in_order(rows, answers), instrument, turned=found)
+    return NightAnswers(_in_order(rows, ((s, None) for s in found.solutions)), instrument, turned=found)
 
 
 def _one_by_one(sights: Iterable[tuple[str, Sight | FrameError]], asked: Solving) -> Iterator[FrameAnswer]:
@@ -175,18 +174,18 @@ def _without_lamps(answers: Iterable[FrameAnswer]) -> Iterator[FrameAnswer]:
 
 
 def _in_order(
-    rows: Iterable[tuple[str, Sight | FrameError]], answers: Iterable[FrameAnswer]
+    rows: Iterable[tuple[str, Sight | FrameError]], answers: Iterable[tuple[Solution, "Watched | None"]]
 ) -> Iterator[FrameAnswer]:
-    """The answer to each frame; answers: to those that can be read, in order."""
+    """The answer to each frame; answers: to those that can be read, in order, and how they compare with GNSS."""
     following = iter(answers)
     for name, sight in rows:
         if isinstance(sight, FrameError):
             yield FrameAnswer.unreadable(name, sight)
             continue
-        answer = replace(next(following), name=name)
+        solution, watched = next(following)
         # a header's wrong focal length was noticed when the frame was identified
-        remark = answer.solution.remark or sight.solution.remark
-        yield replace(answer, solution=replace(answer.solution, remark=remark))
+        solution = replace(solution, remark=solution.remark or sight.solution.remark)
+        yield FrameAnswer(name, solution, sight.stars, watched)
 
 
 def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress = quiet) -> Night:

@@ -59,15 +59,14 @@ class Gathered:
 
     solved: those with a fix, without the details of each star; headings: those with a heading at a known place;
     circles: of those that saw the Sun, which serve where nothing is solved; warnings: of all, each once.
-    marks_deg: the places that GPS wrote into the files of those with a fix.
-    site: of the header of the first of them that states one.
+    mark, site: of the first with a fix that has one: where GPS put it by its file, and the site of its header.
     lost: the stars of the first frame that was not identified; None without one.
     unreadable: whether a file was.
     """
 
     def __init__(self) -> None:
         self.solved: list[Solution] = []
-        self.marks_deg: list[tuple[float, float]] = []
+        self.mark: Near | None = None
         self.site: Near | None = None
         self.headings: list[Solution] = []
         self.circles: list[Circle] = []
@@ -83,12 +82,12 @@ class Gathered:
         if s.fix:
             light = replace(s.fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
             self.solved.append(replace(s, fix=light, star=None, found=None, hint=None, at_place=None))
-            if answer.stars is not None and answer.stars.gps_deg is not None:
-                self.marks_deg.append(answer.stars.gps_deg)
-            if answer.stars is not None and answer.stars.site_deg is not None and self.site is None:
-                latitude, longitude = np.radians(answer.stars.site_deg).tolist()
-                stated_by = f"the header's {answer.stars.site_cards}"
-                self.site = Near(latitude, longitude, stated_by=stated_by, either_sign=True)
+            stars = answer.stars
+            if stars is not None and stars.gps_deg is not None and self.mark is None:
+                self.mark = Near(*np.radians(stars.gps_deg).tolist())
+            if stars is not None and stars.site_deg is not None and self.site is None:
+                stated_by = f"the header's {stars.site_cards}"
+                self.site = Near(*np.radians(stars.site_deg).tolist(), stated_by=stated_by, either_sign=True)
         if s.at_place:
             self.headings.append(s)
         if s.circle is not None:
@@ -141,10 +140,8 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
             mounting = given.mounting
         said += [] if whole is None else [remarks.of_table(fixes, whole, given)]
         said += [remarks.of_copies(fixes)] if given.has_level_inside else []
-    said += [
-        remarks.of_marks(place, gathered.marks_deg),
-        *doubts(fixes, place, mounting, near or gathered.site),
-    ]
+    said += [] if gathered.mark is None else [remarks.of_mark(place, gathered.mark)]
+    said += doubts(fixes, place, mounting, near or gathered.site)
     return Together(whole, why_not, tuple(filter(None, said)))
 
 

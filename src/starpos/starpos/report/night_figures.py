@@ -153,16 +153,8 @@ def draw_budget(figure: "Figure", night: Night) -> None:
         low = max(min(highest) * 1e-3, min((v for row in values for v in row if v > 0), default=top) / 2)
         for j, ((label, _, colour), row) in enumerate(zip(places, values, strict=True)):
             at = np.arange(len(names)) + (len(places) / 2 - 0.5 - j) * height
-            axes.barh(at, np.maximum(np.nan_to_num(row), low), height, color=colour, label=label)
-            for y, value in zip(at, row, strict=True):
-                axes.text(
-                    max(np.nan_to_num(value), low) * 1.15,
-                    y,
-                    _short(value),
-                    va="center",
-                    fontsize=7,
-                    color="#333333",
-                )
+            bars = axes.barh(at, np.maximum(np.nan_to_num(row), low), height, color=colour, label=label)
+            axes.bar_label(bars, list(map(_short, row)), padding=2, fontsize=7, color="#333333")
         axes.set_xscale("log")
         axes.set_xlim(low, top * 12)
         axes.set_xlabel(title)
@@ -215,34 +207,31 @@ def draw_health(figure: "Figure", night: Night) -> None:
     at, label = _times(shots)
     panels = figure.subplots(4, 1, sharex=True)
     mark, size = ("o", 3.5) if len(shots) <= MANY else (".", 2.5)
-    points: dict[str, Any] = {"ms": size, "ls": "none", "marker": mark}
-    panels[0].plot(
-        at,
-        [s.stars_detected for s in shots],
-        color=ORANGE,
-        label="detected",
-        **points | {"ms": 1.8 * size, "mfc": "none"},
-    )
-    panels[0].plot(at, [s.stars_matched for s in shots], color=BLUE, label="in the fix", **points)
+
+    def draw(
+        axes: "Axes", values: Sequence[float] | np.ndarray, colour: str, label: str = "", **more: Any
+    ) -> None:
+        axes.plot(at, values, color=colour, label=label, **{"ms": size, "ls": "none", "marker": mark} | more)
+
+    draw(panels[0], [s.stars_detected for s in shots], ORANGE, "detected", ms=1.8 * size, mfc="none")
+    draw(panels[0], [s.stars_matched for s in shots], BLUE, "in the fix")
     panels[0].set_ylabel("stars")
     panels[0].set_ylim(0, 1.15 * max(1, *(s.stars_detected for s in shots)))
     _legend(panels[0])
     residual = np.array([s.residual_arcsec for s in shots])
-    panels[1].plot(at, residual, color=BLUE, **points)
+    draw(panels[1], residual, BLUE)
     panels[1].set_ylabel("residual,\narcsec")
     panels[1].set_ylim(0, 1.2 * np.nanmax(np.append(residual, 1e-3)))
     tilt = np.degrees([s.tilt for s in shots]) * 3600
     known = np.isfinite(tilt).all(1)
     mean = tilt[known].mean(0) if known.any() else np.zeros(2)
     for k, (axis, colour) in enumerate((("x", GREEN), ("y", PURPLE))):
-        panels[2].plot(
-            at, tilt[:, k] - mean[k], color=colour, label=f"{axis} about {mean[k] / 3600:+.4f}°", **points
-        )
+        draw(panels[2], tilt[:, k] - mean[k], colour, f"{axis} about {mean[k] / 3600:+.4f}°")
     panels[2].set_ylabel("tilt,\narcsec")
     _legend(panels[2])
     seconds = np.array([[s.identify_s, s.fix_s] for s in shots]) * 1e3
-    panels[3].plot(at, seconds[:, 0], color=ORANGE, label="identification", **points)
-    panels[3].plot(at, seconds[:, 1], color=BLUE, label="fix", **points)
+    draw(panels[3], seconds[:, 0], ORANGE, "identification")
+    draw(panels[3], seconds[:, 1], BLUE, "fix")
     panels[3].set_ylabel("time, ms")
     panels[3].set_ylim(0, 1.2 * np.nanmax(np.append(seconds, 1.0)))
     _legend(panels[3])
