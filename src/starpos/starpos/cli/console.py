@@ -79,6 +79,11 @@ def complain(*said: object) -> None:
         print(f"starpos {_speaking.get()}: {each}", file=sys.stderr)
 
 
+def named(name: str, said: str) -> str:
+    """A sentence on a frame, with its name before it unless it is in it."""
+    return said if name in said else f"{name}: {said}"
+
+
 class FrameComplaints:
     """Complains about frames: a sentence that is true of several, but for their names, is printed once."""
 
@@ -91,7 +96,7 @@ class FrameComplaints:
         alike = self._frames.setdefault(reason, [])
         alike.append(name)
         if len(alike) == 1:
-            complain(error if name in str(error) else f"{name}: {error}")
+            complain(named(name, str(error)))
 
     def end(self) -> None:
         """Say how many more frames each sentence is true of."""

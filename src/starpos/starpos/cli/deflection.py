@@ -133,11 +133,7 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
     if not args.frames or args.tilt is None:
         raise InstrumentError("give frames and --tilt CSV, or a bag")
     read, frames = inputs.reader_of(args), inputs.frames_among(args.frames, args.tilt)
-    about = read.first(frames)
-    if about is None:
-        # says why
-        read(frames[0])
-    assert about is not None
+    about = read.one_of(frames)
     air = options.atmosphere_of(args)
     given, remarks = work_of(inputs.given_of(args, about), about, Path(args.tilt), air)
     console.complain(*remarks)
@@ -145,7 +141,7 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
     assert instrument is not None
     inputs.prepare(instrument, about)
     work = partial(read.on, partial(zenith_seen, given, mark))
-    return list(zip(frames, inputs.worked(args, work, frames, lines=False), strict=True)), instrument
+    return list(inputs.worked(args, work, frames, lines=False)), instrument
 
 
 def _is_bag(args: argparse.Namespace) -> bool:
@@ -204,5 +200,4 @@ def _mark_of(args: argparse.Namespace) -> Place:
 
 
 def _why(path: str, answer: Solution | FrameError) -> str:
-    said = str(answer) if isinstance(answer, FrameError) else answer.message
-    return said if path in said else f"{path}: {said}"
+    return console.named(path, str(answer) if isinstance(answer, FrameError) else answer.message)

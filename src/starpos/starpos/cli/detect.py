@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 def run(args: argparse.Namespace) -> int:
     output = console.Output(args, "stars")
     args.frames = inputs.frames_among(args.frames)
-    status, answers = 0, inputs.worked(args, partial(Reader().on, detected), args.frames)
-    for path, answer in zip(args.frames, answers, strict=True):
+    status = 0
+    for path, answer in inputs.worked(args, partial(Reader().on, detected), args.frames):
         if isinstance(answer, FrameError):
             status = console.UNREADABLE
         _tell(path, answer, output)

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from starpos.cli import console, options
 from starpos.earth.place import Place
@@ -26,7 +26,7 @@ from starpos.frames.reading import are_photographs, read_frame, why_no_time
 from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.instrument import Instrument
-from starpos.night.opening import work_of
+from starpos.night.opening import frames_in, work_of
 from starpos.night.reading import Instruments, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
 from starpos.night.work import Solving
@@ -85,11 +85,7 @@ def seen_at(args: argparse.Namespace, place: Place) -> Iterator[Seen]:
     Frames without an attitude are complained about.  Raises StarposError as `solve` does.
     """
     read = reader_of(args)
-    about = read.first(args.frames)
-    if about is None:
-        # says why
-        read(args.frames[0])
-    assert about is not None
+    about = read.one_of(args.frames)
     work, remarks = work_of(given_or_sought(args, about), about, None, options.atmosphere_of(args), place)
     console.complain(*remarks)
     if work.instruments.sought:
@@ -105,8 +101,7 @@ def seen_at(args: argparse.Namespace, place: Place) -> Iterator[Seen]:
         if at_place is None or answer.found is None:
             timed = answer.found is None or item.mid_unix_s
             no_time = f"{item.place}: no time of exposure: {why_no_time(item)}"
-            why = answer.message if item.place in answer.message else f"{item.place}: {answer.message}"
-            console.complain(why if timed else no_time)
+            console.complain(console.named(item.place, answer.message) if timed else no_time)
             continue
         instrument = sight.instrument or work.instruments.of(item)
         assert instrument is not None
@@ -207,8 +202,6 @@ def stated_site(frames: Sequence[str]) -> str:
 
 
 def _night(folder: str) -> NightFolder | FrameError:
-    from starpos.night.opening import frames_in
-
     try:
         frames = tuple(map(str, frames_in(Path(folder))))
     except FrameError as error:
@@ -261,10 +254,11 @@ def worked(
     paths: Sequence[str],
     what: str = "frame",
     lines: bool = True,
-) -> Iterator:
-    """What a work makes of each file, in their order, by the workers of --jobs, as `watched`."""
+) -> Iterator[tuple[str, Any]]:
+    """Each file with what a work makes of it, in their order, by the workers of --jobs, as `watched`."""
     with workers_of(args, paths) as workers:
-        yield from watched(workers.map((work, path) for path in paths), len(paths), what, lines)
+        answers = watched(workers.map((work, path) for path in paths), len(paths), what, lines)
+        yield from zip(paths, answers, strict=True)
 
 
 def watched(answers: Iterable, number: int, what: str = "frame", lines: bool = True) -> Iterator:

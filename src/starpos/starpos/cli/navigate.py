@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     inputs.prepare(instrument, about)
     given = replace(inputs.given_of(args, about), instrument=instrument)
     work = partial(read.on, partial(under_way.voyage_frame, given))
-    frames = under_way.voyage_frames(inputs.worked(args, work, args.frames))
+    frames = under_way.voyage_frames(answer for _, answer in inputs.worked(args, work, args.frames))
     for frame in frames:
         console.complain(frame.message)
     voyage = under_way.voyage_of(frames, args.imu, args.velocity, vessel, console.ProgressBar())

@@ -22,11 +22,8 @@ def run(args: argparse.Namespace) -> int:
     # a wrong parameter is reported once, not for each bag
     Drivers.of(args.params_file, args.param, args.namespace)
     work = Playing(args.params_file, tuple(args.param), args.namespace, remaps_of(args.remap))
-    answers = inputs.worked(args, work, args.bags, "bag")
-    return max(
-        tell(args, output, bag, night, settings.vertical)
-        for bag, night in zip(args.bags, answers, strict=True)
-    )
+    nights = inputs.worked(args, work, args.bags, "bag")
+    return max(tell(args, output, bag, night, settings.vertical) for bag, night in nights)
 
 
 def tell(

@@ -4,7 +4,7 @@
 Frames are solved one by one, or all together: by turning, or compared with GNSS.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -204,7 +204,7 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
     ]
     if gathered.lost is not None and not gathered.solved:
         of_frames.append(work.fitting(gathered.lost))
-    night = Night(
+    return Night(
         name=exposures.name,
         origin=exposures.origin,
         shots=shots,
@@ -213,20 +213,18 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
         vertical=exposures.vertical,
         atmosphere=exposures.work.atmosphere,
         truth=exposures.truth,
+        steady=_steady(shots, answers.instrument) if whole.average and answers.instrument else None,
         watched=answers.watched,
         remarks=(*exposures.remarks, *said, *filter(None, of_frames), *whole.remarks),
     )
-    if night.combined is None or answers.instrument is None:
-        return night
-    return replace(night, steady=_steady(night, answers.instrument))
 
 
-def _steady(night: Night, instrument: Instrument) -> np.ndarray | None:
+def _steady(shots: Sequence[Shot], instrument: Instrument) -> np.ndarray | None:
     """Places (N, 3) for Night.steady, each with the mean tilt of the night; None if the camera was moved."""
-    tilts = np.array([s.tilt for _, s in night.fixed])
-    headings = np.array([p.heading for p in night.places])
-    own = np.array([p.own for p in night.places])
-    attitudes = [s.camera_to_itrs for _, s in night.fixed if s.camera_to_itrs is not None]
+    tilts = np.array([s.tilt for s in shots if s.place])
+    headings = np.array([s.place.heading for s in shots if s.place])
+    own = np.array([s.place.own for s in shots if s.place])
+    attitudes = [s.camera_to_itrs for s in shots if s.camera_to_itrs is not None]
     moved = np.abs(tilts - np.median(tilts, axis=0)).max() * EARTH_RADIUS_M
     noise = np.sqrt(np.median(np.trace(own[:, :2, :2], axis1=1, axis2=2) / 2))
     turned = np.abs(half_turns(headings - headings[0])).max()
