@@ -139,7 +139,7 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
     console.complain(*remarks)
     instrument = given.instruments.instrument
     assert instrument is not None
-    inputs.prepare(instrument, about)
+    inputs.prepare(given.instruments, about)
     work = partial(read.on, partial(zenith_seen, given, mark))
     return list(inputs.worked(args, work, frames, lines=False)), instrument
 

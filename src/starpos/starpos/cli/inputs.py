@@ -25,7 +25,7 @@ from starpos.frames.frame import Frame, Stars, no_stars
 from starpos.frames.reading import are_photographs, read_frame, why_no_time
 from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB, Camera
-from starpos.instrument.instrument import Instrument
+from starpos.instrument.instrument import ByGravity, Instrument
 from starpos.night.opening import frames_in, work_of
 from starpos.night.reading import Instruments, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
@@ -113,11 +113,10 @@ def identifying(args: argparse.Namespace, frames: Sequence[str], read: Reader, s
     """The work that identifies frames with the camera of the options, else of their headers, else of any scale."""
     about = read.first(frames)
     given = Instruments(None, by_header=True)
-    if about is not None and is_untold(args) and about.focal_px is None:
-        BlindSolver(catalogue.load_catalogue(), console.ProgressBar()).prepare()
-    elif about is not None:
-        given = given_of(args, about)
-        prepare(options.instrument_of(args, about), about)
+    if about is not None:
+        if about.focal_px is not None or not is_untold(args):
+            given = given_of(args, about)
+        prepare(given, about)
     # without a frame that can be read, each one reports why it cannot
     return Solving(given, search_s=search_s, progress=console.ProgressBar())
 
@@ -146,12 +145,12 @@ def near_of(args: argparse.Namespace) -> Near | None:
 class NightFolder:
     """Frames with one table of tilts that make one fix together.
 
-    tilt: absolute path; None where none is needed, or photographs have their own.
+    tilt: absolute path, or that photographs have their own; None where none is needed.
     folder: None if the frames were named one by one.
     """
 
     frames: tuple[str, ...]
-    tilt: str | None
+    tilt: Path | ByGravity | None
     folder: str | None = None
 
 
@@ -178,13 +177,13 @@ def nights_of(
     Raises FrameError for a path that does not exist, TiltError for frames without a table.
     """
     if tilt is not None:
-        return [NightFolder(tuple(given), os.path.abspath(tilt))]
+        return [NightFolder(tuple(given), Path(os.path.abspath(tilt)))]
     if needs_no_tilt:
         return [NightFolder(tuple(given), None)]
     if missing := next((path for path in given if not os.path.exists(path)), None):
         raise FrameError(f"{missing}: there is no such file or folder")
     if are_photographs(given):
-        return [NightFolder(tuple(given), None)]
+        return [NightFolder(tuple(given), ByGravity())]
     if single := next((path for path in given if not os.path.isdir(path)), None):
         raise TiltError(
             f"{single}: no tilts: give --tilt with frames, or nights alone: folders of frames, each with its tilt.csv; "
@@ -206,8 +205,9 @@ def _night(folder: str) -> NightFolder | FrameError:
         frames = tuple(map(str, frames_in(Path(folder))))
     except FrameError as error:
         return error
-    tilt = os.path.abspath(os.path.join(folder, TILTS))
-    return NightFolder(frames, None if are_photographs(frames) and not os.path.exists(tilt) else tilt, folder)
+    tilt = Path(os.path.abspath(os.path.join(folder, TILTS)))
+    by_gravity = are_photographs(frames) and not tilt.exists()
+    return NightFolder(frames, ByGravity() if by_gravity else tilt, folder)
 
 
 PIP = "pip install matplotlib rosbags"
@@ -270,9 +270,13 @@ def watched(answers: Iterable, number: int, what: str = "frame", lines: bool = T
         yield answer
 
 
-def prepare(instrument: Instrument, about: Stars) -> None:
-    """Put the tables of a field into the cache, for all processes of a machine; reports what the catalogue lacks."""
-    solver = Solver(instrument, catalogue.load_catalogue(), progress=console.ProgressBar())
+def prepare(given: Instruments, about: Stars) -> None:
+    """Put the tables of a field, or of any, into the cache, for all processes; reports what the catalogue lacks."""
+    stars, bar = catalogue.load_catalogue(), console.ProgressBar()
+    if given.instrument is None or given.sought:
+        BlindSolver(stars, bar).prepare()
+        return
+    solver = Solver(given.instrument, stars, progress=bar)
     # the frames report the error
     with suppress(StarposError):
         if thin := solver.prepare(about.width, about.height, about.origin_px):

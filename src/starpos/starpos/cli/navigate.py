@@ -50,8 +50,8 @@ def run(args: argparse.Namespace) -> int:
         drift_stddev=args.drift_stddev,
     )
     console.complain(remark)
-    inputs.prepare(instrument, about)
     given = replace(inputs.given_of(args, about), instrument=instrument)
+    inputs.prepare(given, about)
     work = partial(read.on, partial(under_way.voyage_frame, given))
     frames = under_way.voyage_frames(answer for _, answer in inputs.worked(args, work, args.frames))
     for frame in frames:

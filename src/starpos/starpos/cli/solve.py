@@ -17,7 +17,6 @@ from starpos.cli import console, fix_output, inputs, options, overwriting, place
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import InstrumentError, StarposError, TiltError
-from starpos.fix.blind import BlindSolver
 from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.circle import Circle
 from starpos.fix.solution import Solution
@@ -324,7 +323,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
     nights = [night for night in given if isinstance(night, inputs.NightFolder)]
-    by_gravity = not needs_no_tilt and any(night.tilt is None for night in nights)
+    by_gravity = any(isinstance(night.tilt, ByGravity) for night in nights)
     by_log = args.tilt is not None and is_phone_log(Path(args.tilt)) and are_photographs(args.frames)
     read = inputs.reader_of(args, by_gravity or by_log)
     statuses = [_refused(why, given) for why in given if not isinstance(why, inputs.NightFolder)]
@@ -333,7 +332,7 @@ def _run(args: argparse.Namespace) -> int:
         abouts = workers.map((partial(read.first, levelled=by_gravity), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):
             try:
-                plans.append((night, _work(args, night, about, own_level, place, by_gravity)))
+                plans.append((night, _work(args, night, about, own_level, place)))
             except TiltError as error:
                 statuses.append(_refused(error, given))
         on_files = [partial(read.on, how.work(work)) for _, work in plans]
@@ -364,21 +363,17 @@ def _work(
     about: Stars | None,
     own_level: bool,
     place: Place | None,
-    by_gravity: bool,
 ) -> Solving:
     """The work on a night's frames, after complaints about what looks wrong; raises TiltError."""
     air = options.atmosphere_of(args)
     # without a frame that can be read, each one reports why it cannot
     if about is None:
         return Solving(Instruments(None), atmosphere=air)
-    tilt = Path(night.tilt) if night.tilt is not None else ByGravity() if by_gravity else None
-    work, remarks = work_of(inputs.given_or_sought(args, about), about, tilt, air, place)
+    work, remarks = work_of(inputs.given_or_sought(args, about), about, night.tilt, air, place)
     work = replace(work, ephemeris=options.ephemeris_of(args))
     console.complain(*remarks)
     assert work.instruments.instrument is not None
-    if work.instruments.sought:
-        BlindSolver(catalogue.load_catalogue(), console.ProgressBar()).prepare()
-        return work
-    check_save(args, work.instruments.instrument)
-    inputs.prepare(work.instruments.instrument, about)
+    if not work.instruments.sought:
+        check_save(args, work.instruments.instrument)
+    inputs.prepare(work.instruments, about)
     return replace(work, tilts=NO_TILTS) if own_level else work
