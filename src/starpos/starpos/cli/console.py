@@ -79,6 +79,11 @@ def complain(*said: object) -> None:
         print(f"starpos {_speaking.get()}: {each}", file=sys.stderr)
 
 
+def complain_of(night: str | None, *said: object) -> None:
+    """Complain about a night; None where it is not named."""
+    complain(*(each if night is None else f"{night}: {each}" for each in said if each))
+
+
 def named(name: str, said: str) -> str:
     """A sentence on a frame, with its name before it unless it is in it."""
     return said if name in said else f"{name}: {said}"

@@ -37,8 +37,7 @@ def tell(
     if isinstance(night, FrameError):
         console.complain(night)
         return console.UNREADABLE
-    for sentence in night.said:
-        console.complain(f"{bag}: {sentence}")
+    console.complain_of(bag, *night.said)
     gathered = Gathered()
     for solution in night.solutions:
         gathered.gather(FrameAnswer(bag, solution))
@@ -56,8 +55,7 @@ def tell(
     if whole:
         calibration = night.instrument.calibration
         remarks.append(unknown_a3(calibration, whole.covariance, whole.terms, BY_PARAMETERS))
-    for remark in filter(None, remarks):
-        console.complain(f"{bag}: {remark}")
+    console.complain_of(bag, *remarks)
     if solved:
         fix_output.put_combined(output, bag if len(args.bags) > 1 else None, whole, gathered, vertical)
     if (by_satellites := night.by_satellites) is not None:

@@ -68,7 +68,7 @@ def tell(
     statuses = [] if answers.turned is None else [tell_turned(args, folder, answers.turned)]
     watched, gathered, complaints = answers.watched, Gathered(), console.FrameComplaints()
     if watched is not None:
-        say(folder, *watched.remarks)
+        console.complain_of(folder, *watched.remarks)
         if args.learned is not None:
             _save_learned(Path(args.learned), watched.learned)
     for answer in answers.each:
@@ -86,7 +86,7 @@ def tell(
     unnamed = ""
     if fixes and watched is not None and answers.instrument is not None:
         unnamed = unnamed_inclinometer(answers.instrument)
-    say(folder, whole.why_not, unnamed, *whole.remarks, why)
+    console.complain_of(folder, whole.why_not, unnamed, *whole.remarks, why)
     where = whole.average or (fixes[-1] if fixes else None)
     about = fix_output.about_average(args, where, vertical, near)
     if place is not None:
@@ -96,7 +96,7 @@ def tell(
     if where is not None or (headings and place is not None):
         fix_output.put_combined(output, folder, whole.average, gathered, vertical, about, mean)
     elif gathered.lost is not None and not headings and work is not None:
-        say(folder, work.fitting(gathered.lost))
+        console.complain_of(folder, work.fitting(gathered.lost))
     # without tilts headings are all that was asked for, and by day they are all there is
     by_day = any(s.bodies for s in headings)
     found = bool(headings) if place is not None and (by_day or not args.tilt) else whole.average is not None
@@ -141,20 +141,16 @@ def check_save(args: argparse.Namespace, instrument: Instrument) -> None:
 def tell_turned(args: argparse.Namespace, folder: str | None, turned: TurnedNight) -> int:
     """Say what was found by turning, and write A3 as --save asks; NOTHING if it is asked for and not written."""
     if turned.calibrated is None or not turned.worth_saving:
-        say(folder, *turned.remarks, *([] if args.save is None else [f"{args.save} is not written"]))
+        console.complain_of(
+            folder, *turned.remarks, *([] if args.save is None else [f"{args.save} is not written"])
+        )
         return 0 if args.save is None else console.NOTHING
     if args.save is not None:
         about = f"A3 by turning on the spot, {turned.remarks[0]}"
         overwriting.save_instrument(args.save, turned.calibrated.instrument, about)
     kept = "--save OUT keeps A3 and its errors" if args.save is None else f"{args.save} is written"
-    say(folder, *turned.remarks, kept)
+    console.complain_of(folder, *turned.remarks, kept)
     return 0
-
-
-def say(folder: str | None, *texts: object) -> None:
-    """Print lines about a whole night on standard error."""
-    for text in filter(None, texts):
-        console.complain(text if folder is None else f"{folder}: {text}")
 
 
 def how_of(args: argparse.Namespace) -> How:

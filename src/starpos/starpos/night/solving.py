@@ -4,6 +4,7 @@
 Frames are solved one by one, or all together: by turning, or compared with GNSS.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -12,18 +13,19 @@ import numpy as np
 
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
-from starpos.errors import FrameError
+from starpos.errors import FrameError, GnssError
 from starpos.fix.attitude import heading_of
 from starpos.fix.budget import local_north
 from starpos.fix.glows import Glow
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solution import Solution
+from starpos.fix.solver import Solver, placed
 from starpos.frames.frame import Frame, Stars
 from starpos.identification.prior import Hint
 from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.tilt_log import NO_TILTS
-from starpos.night.night import Night, Shot, Truth, why_none
+from starpos.instrument.tilt_log import NO_TILTS, Tilts
+from starpos.night.night import Night, Shot, Truth, WatchedNight, why_none
 from starpos.night.together import FrameAnswer, Gathered, TurnedNight, together, turned
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
@@ -33,7 +35,6 @@ if TYPE_CHECKING:
     from starpos.gnss.receiver import GnssTrack
     from starpos.gnss.solving import Watched
     from starpos.gnss.states import Learned
-    from starpos.night.beside_gnss import WatchedNight
 
 # if readings are further from their median than this, the camera was moved
 STILL_SIGMA = 8.0
@@ -97,7 +98,7 @@ class NightAnswers:
     instrument: Instrument | None = None
     given: Instrument | None = None
     turned: TurnedNight | None = None
-    watched: "WatchedNight | None" = None
+    watched: WatchedNight | None = None
 
 
 def answers_of(
@@ -118,9 +119,7 @@ def answers_of(
     solver = replace(asked.solver(seen[0].stars), progress=progress)
     solver, alike = of_one_camera(solver, seen)
     if how.gnss is not None:
-        from starpos.night.beside_gnss import watched_night
-
-        watched = watched_night(solver, alike, asked.tilts, how.gnss, how.learned, vertical)
+        watched = _watched_night(solver, alike, asked.tilts, how.gnss, how.learned, vertical)
         each = _in_order(rows, ((a.solution, a) for a in watched.answers))
         return NightAnswers(each, solver.instrument, watched=watched)
     assert how.turn_stddev_deg is not None
@@ -186,6 +185,42 @@ def _in_order(
         # a header's wrong focal length was noticed when the frame was identified
         solution = replace(solution, remark=solution.remark or sight.solution.remark)
         yield FrameAnswer(name, solution, sight.stars, watched)
+
+
+def _watched_night(
+    solver: Solver,
+    sights: Sequence[Sight],
+    tilts: Tilts | None,
+    track: "GnssTrack",
+    before: "Learned | None",
+    vertical: Vertical,
+) -> WatchedNight:
+    """Solve a night's frames, which are identified already, in the order of their times.
+
+    tilts: None where headings alone are wanted.  before: what earlier nights learned of the instrument.
+    """
+    from starpos.gnss.solving import watched
+    from starpos.gnss.watch import GnssWatch
+
+    watch = GnssWatch(solver.instrument, vertical, before)
+    said: Counter[str] = Counter()
+    answers: dict[int, Watched] = {}
+    for k in sorted(range(len(sights)), key=lambda k: sights[k].stars.mid_unix_s or 0.0):
+        stars, rough, gnss = sights[k].stars, sights[k].solution, None
+        if stars.mid_unix_s is not None:
+            try:
+                gnss = track.at(stars.mid_unix_s)
+            except GnssError as error:
+                said[str(error)] += 1
+        if rough.found is not None and tilts is not None:
+            solved = solver.solve(stars, tilts, known=rough.found)
+            refused = replace(rough, status=solved.status, message=solved.message)
+            rough = refused if solved.found is None else solved
+        if gnss is not None:
+            rough = placed(solver, stars, rough, gnss.deflected(vertical))
+        answers[k] = watched(solver, stars, rough, gnss, watch)
+    remarks = tuple(f"{number} frames: {why}" for why, number in said.items())
+    return WatchedNight(tuple(answers[k] for k in range(len(sights))), watch.learned, remarks)
 
 
 def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress = quiet) -> Night:
