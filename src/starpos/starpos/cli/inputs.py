@@ -37,12 +37,18 @@ if TYPE_CHECKING:
     from starpos.night.solving import Exposures
 
 
+# the word of --exif-utc-offset that lets each file say it
+FILES_OWN = "file"
+
+
 def reader_of(args: argparse.Namespace, by_files: bool = False) -> Reader:
     """The reader of frames with the clock and the delay of their shutter that the options give.
 
     by_files: without a clock by the options, each file's own counts, as its EXIF states it.
     """
-    clock = options.clock_of(args) or (CameraClock() if by_files else None)
+    offset_h, clock = args.exif_utc_offset, CameraClock() if by_files else None
+    if offset_h is not None:
+        clock = CameraClock(None if offset_h == FILES_OWN else offset_h, args.exif_clock_stddev)
     return Reader(clock, tuple(args.shutter_delay or (0.0, 0.0)))
 
 

@@ -13,7 +13,6 @@ from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
 from starpos.errors import InstrumentError
 from starpos.fix.directions import OPTICAL_AXIS
-from starpos.frames.exif import CameraClock
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument import instrument, instrument_file, platepar, sensors
@@ -51,17 +50,6 @@ def fill_site(args: argparse.Namespace) -> None:
         return
     station = platepar.read(args.instrument)
     args.site, args.geodetic = [station.latitude_deg, station.longitude_deg], True
-
-
-FILES_OWN = "file"
-
-
-def clock_of(args: argparse.Namespace) -> CameraClock | None:
-    """The clock that wrote the times in EXIF; None if the options do not give it.  Raises InstrumentError."""
-    offset_h, stddev_s = args.exif_utc_offset, args.exif_clock_stddev
-    if offset_h is None:
-        return None
-    return CameraClock(None if offset_h == FILES_OWN else offset_h, stddev_s)
 
 
 def turn_of(args: argparse.Namespace) -> float:

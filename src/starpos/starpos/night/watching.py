@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera that stands still, night by night: whether it has moved, by how much, and how much the air dims its stars."""
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -281,6 +280,9 @@ def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
 
     The sizes of the wander from night to night are weighed by what the nights have shown of them so far.
     """
+    # slow to import, and of no use to what shares this module
+    from scipy.special import chdtrc
+
     log_weight = -RARER * np.log(np.maximum(WANDERS_RAD / USUAL_RAD, 1))
     found: list[Kept] = []
     first, nights, sums = np.eye(3), 0, (np.zeros((len(WANDERS_RAD), 3, 3)), np.zeros((len(WANDERS_RAD), 3)))
@@ -298,7 +300,7 @@ def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
             weight = np.exp(log_weight - log_weight.max())
             weight /= weight.sum()
             turned, covariance = weight @ off, np.tensordot(weight, total, 1)
-            alarm = bool(weight @ [_chance(x) for x in chi2] < ALARM_CHANCE)
+            alarm = bool(weight @ chdtrc(3, chi2) < ALARM_CHANCE)
             if not alarm:
                 log_weight -= (chi2 + np.linalg.slogdet(total)[1]) / 2
         found.append(
@@ -313,8 +315,3 @@ def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
         )
         nights += 1
     return tuple(found)
-
-
-def _chance(chi2: float) -> float:
-    """Probability that three normal numbers have a larger sum of squares."""
-    return math.erfc(math.sqrt(chi2 / 2)) + math.sqrt(2 * chi2 / math.pi) * math.exp(-chi2 / 2)
