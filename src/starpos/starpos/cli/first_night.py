@@ -47,10 +47,10 @@ def run(args: argparse.Namespace) -> int:
         console.complain(f"stopped: {AGAIN}")
         return console.NOTHING
     found = None if night is None else night.turned
-    if found is None or found.calibrated is None:
+    if found is None:
         console.complain(f"no frame has come for {args.patience:g} s, and A3 is not known yet: {AGAIN}")
         return console.NOTHING
-    overwriting.save_instrument(args.save, found.calibrated.instrument, "A3 by the first night")
+    overwriting.save_instrument(args.save, found.instrument, "A3 by the first night")
     print(f"done: {args.save} is written -> starpos solve FRAMES --tilt {TILTS} --instrument {args.save}")
     if args.field is not None:
         packed = exposures(folder, given, options.atmosphere_of(args), Deflection(), read=reader_of(args))

@@ -13,6 +13,7 @@ import numpy as np
 
 from starpos.averaging.elevation_axis import FoundAxis
 from starpos.averaging.sights import circle_of_sight, place_of_sights, read_sights
+from starpos.calibration.misalignment import Calibrated
 from starpos.cli import console, fix_output, inputs, options, overwriting, places_file
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
@@ -31,13 +32,12 @@ from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night import field
 from starpos.night.opening import work_of
 from starpos.night.reading import NO_CAMERA, Instruments
-from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near
+from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, worth_saving
 from starpos.night.solving import How, NightAnswers, answers_of
 from starpos.night.together import (
     FrameAnswer,
     Gathered,
     Together,
-    TurnedNight,
     from_elevations,
     together,
     turned,
@@ -65,10 +65,12 @@ def tell(
     place: the known place, whose headings are then reported; None without one.
     work: on the frames, which may say which focal length fits those that were not identified.
     """
-    statuses = [] if answers.turned is None else [tell_turned(args, folder, answers.turned)]
+    statuses = []
+    if answers.turned is not None:
+        statuses.append(tell_turned(args, folder, answers.turned, answers.remarks))
     watched, gathered, complaints = answers.watched, Gathered(), console.FrameComplaints()
     if watched is not None:
-        console.complain_of(folder, *watched.remarks)
+        console.complain_of(folder, *answers.remarks)
         if args.learned is not None:
             _save_learned(Path(args.learned), watched.learned)
     for answer in answers.each:
@@ -138,18 +140,18 @@ def check_save(args: argparse.Namespace, instrument: Instrument) -> None:
         instrument_file.check_fits(Path(args.save), instrument)
 
 
-def tell_turned(args: argparse.Namespace, folder: str | None, turned: TurnedNight) -> int:
+def tell_turned(
+    args: argparse.Namespace, folder: str | None, turned: Calibrated, remarks: Sequence[str]
+) -> int:
     """Say what was found by turning, and write A3 as --save asks; NOTHING if it is asked for and not written."""
-    if turned.calibrated is None or not turned.worth_saving:
-        console.complain_of(
-            folder, *turned.remarks, *([] if args.save is None else [f"{args.save} is not written"])
-        )
+    if not worth_saving(turned):
+        console.complain_of(folder, *remarks, *([] if args.save is None else [f"{args.save} is not written"]))
         return 0 if args.save is None else console.NOTHING
     if args.save is not None:
-        about = f"A3 by turning on the spot, {turned.remarks[0]}"
-        overwriting.save_instrument(args.save, turned.calibrated.instrument, about)
+        about = f"A3 by turning on the spot, {remarks[0]}"
+        overwriting.save_instrument(args.save, turned.instrument, about)
     kept = "--save OUT keeps A3 and its errors" if args.save is None else f"{args.save} is written"
-    console.complain_of(folder, *turned.remarks, kept)
+    console.complain_of(folder, *remarks, kept)
     return 0
 
 
@@ -203,14 +205,16 @@ def run_pointings(args: argparse.Namespace) -> int:
     output = console.Output(args, "fix" if whole else "elevations")
     if not whole:
         return _from_elevations(args, output, solver, tilts, pointings, vertical, near)
-    found, given = None, solver.instrument if not args.self_calibrate else None
+    found: Calibrated | None = None
+    said: tuple[str, ...] = ()
+    given = solver.instrument if not args.self_calibrate else None
     solutions: Iterable[Solution] = (solver.solve_pointing(p, tilts) for p in pointings)
     if args.self_calibrate:
-        found = turned(solver, whole, tilts, options.turn_of(args))
+        found, said = turned(solver, whole, tilts, options.turn_of(args))
         solved = iter(found.solutions)
         solutions = [next(solved) if p.has_roll else solver.solve_pointing(p) for p in pointings]
     each = (FrameAnswer(p.source, s) for p, s in zip(pointings, solutions, strict=True))
-    return tell(args, output, None, NightAnswers(each, given=given, turned=found), vertical)
+    return tell(args, output, None, NightAnswers(each, given=given, turned=found, remarks=said), vertical)
 
 
 def _from_elevations(

@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from starpos import rotation
+from starpos.calibration.misalignment import Calibrated
 from starpos.earth.orientation import earth_state
 from starpos.errors import StarposError
 from starpos.fix.searching import Sight, of_one_camera
@@ -20,7 +21,8 @@ from starpos.frozen import at_once
 from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import TiltLog
-from starpos.night.together import TurnedNight, turned
+from starpos.night.remarks import worth_saving
+from starpos.night.together import turned
 
 # Widths of star images that the detector measures well, px.
 NARROWEST_PX, WIDEST_PX = 1.2, 4.0
@@ -66,13 +68,13 @@ class Standing:
 
 
 class FirstNight:
-    """Inspects the frames of a first night; `turned` is what the last step found.
+    """Inspects the frames of a first night; `turned` is what the last step found, once A3 is known.
 
     solver: with A3 as far as it is known.
     """
 
     def __init__(self, solver: Solver) -> None:
-        self.turned: TurnedNight | None = None
+        self.turned: Calibrated | None = None
         self._solver = solver
         self._steps: list[tuple[str, Callable[[Sight, TiltLog | str], Look]]] = [
             ("focus", self._focus),
@@ -264,10 +266,11 @@ class FirstNight:
             np.full(len(ups), np.nan),
             self._solver.instrument.inclinometer.noise_rad,
         )
-        self.turned = turned(solver, frames, log, TURN_STDDEV_DEG)
-        said = f"{found}; {'; '.join(self.turned.remarks)}"
-        if not self.turned.worth_saving:
+        a3, remarks = turned(solver, frames, log, TURN_STDDEV_DEG)
+        said = f"{found}; {'; '.join(remarks)}"
+        if not worth_saving(a3):
             return Look(False, said, "turn on, to other headings")
+        self.turned = a3
         return Look(True, said, "A3 is known")
 
 

@@ -159,10 +159,15 @@ def of_denied_a3(axis: FoundAxis, given: Calibration) -> str:
     )
 
 
+def worth_saving(turned: Calibrated) -> bool:
+    """Whether the headings determine A3."""
+    return turned.plumb_stddev_arcsec <= WORTH_SAVING_ARCSEC
+
+
 def of_turn(turned: Calibrated) -> Iterator[str]:
     """Say how well A3 was found by turning."""
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
-    if turned.plumb_stddev_arcsec > WORTH_SAVING_ARCSEC:
+    if not worth_saving(turned):
         yield (f"not calibrated: the headings hardly determine A3, {error}: turn it further")
         return
     found = turned.instrument.calibration

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starpos.calibration.misalignment import Calibrated
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, GnssError
@@ -26,7 +27,7 @@ from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night.night import Night, Shot, Truth, WatchedNight, why_none
-from starpos.night.together import FrameAnswer, Gathered, TurnedNight, together, turned
+from starpos.night.together import FrameAnswer, Gathered, together, turned
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
 from starpos.rotation import half_turns
@@ -92,13 +93,15 @@ class NightAnswers:
 
     instrument: on which they rest; None without a frame.
     given: the instrument whose A3 was used unchanged; None where it was found, or taught by GNSS.
+    turned: A3 found by turning.  remarks: on what was found or taught.
     """
 
     each: Iterable[FrameAnswer]
     instrument: Instrument | None = None
     given: Instrument | None = None
-    turned: TurnedNight | None = None
+    turned: Calibrated | None = None
     watched: WatchedNight | None = None
+    remarks: tuple[str, ...] = ()
 
 
 def answers_of(
@@ -121,11 +124,11 @@ def answers_of(
     if how.gnss is not None:
         watched = _watched_night(solver, alike, asked.tilts, how.gnss, how.learned, vertical)
         each = _in_order(rows, ((a.solution, a) for a in watched.answers))
-        return NightAnswers(each, solver.instrument, watched=watched)
+        return NightAnswers(each, solver.instrument, watched=watched, remarks=watched.remarks)
     assert how.turn_stddev_deg is not None
-    found = turned(solver, alike, asked.tilts or NO_TILTS, how.turn_stddev_deg)
-    instrument = solver.instrument if found.calibrated is None else found.calibrated.instrument
-    return NightAnswers(_in_order(rows, ((s, None) for s in found.solutions)), instrument, turned=found)
+    found, said = turned(solver, alike, asked.tilts or NO_TILTS, how.turn_stddev_deg)
+    each = _in_order(rows, ((s, None) for s in found.solutions))
+    return NightAnswers(each, found.instrument, turned=found, remarks=said)
 
 
 def _one_by_one(sights: Iterable[tuple[str, Sight | FrameError]], asked: Solving) -> Iterator[FrameAnswer]:
@@ -234,9 +237,6 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
         of_frames.append(answer.solution.remark)
         progress(exposures.name[:20], done / exposures.count)
     whole = together(gathered, answers.given)
-    said = [
-        remark for part in (answers.turned, answers.watched) if part is not None for remark in part.remarks
-    ]
     if gathered.lost is not None and not gathered.solved:
         of_frames.append(work.fitting(gathered.lost))
     return Night(
@@ -250,7 +250,7 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
         truth=exposures.truth,
         steady=_steady(shots, answers.instrument) if whole.average and answers.instrument else None,
         watched=answers.watched,
-        remarks=(*exposures.remarks, *said, *filter(None, of_frames), *whole.remarks),
+        remarks=(*exposures.remarks, *answers.remarks, *filter(None, of_frames), *whole.remarks),
     )
 
 

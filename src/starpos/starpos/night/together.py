@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a night's frames give together: an average, A3 by turning, a place from elevations; and doubts."""
 
+import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -159,27 +160,12 @@ def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
     return Together.by_circles(place, near)
 
 
-@dataclass(frozen=True)
-class TurnedNight:
-    """A night whose A3 was found by turning: the solution of each frame, A3, None if it was not found, and remarks."""
-
-    solutions: tuple[Solution, ...]
-    calibrated: Calibrated | None = None
-    remarks: tuple[str, ...] = ()
-
-    @property
-    def worth_saving(self) -> bool:
-        """Whether the headings determine A3."""
-        return self.calibrated is not None and (
-            self.calibrated.plumb_stddev_arcsec <= remarks.WORTH_SAVING_ARCSEC
-        )
-
-
 def turned(
     solver: Solver, frames: Sequence[Sight | Pointing], tilts: Tilts, turn_stddev_deg: float
-) -> TurnedNight:
-    """Find A3 and the fixes of a night's frames, which are identified already; one that was not keeps its solution.
+) -> tuple[Calibrated, tuple[str, ...]]:
+    """Find A3 and the fixes of a night's frames, which are identified already; and remarks on how well it was found.
 
+    One that was not identified keeps its solution. Where the frames do not agree, nothing is known of the plumb line.
     turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line.
     """
 
@@ -195,11 +181,12 @@ def turned(
     try:
         found = turn(solver, items, tilts, turn_stddev_deg, solver.progress, known)
     except FixError as error:
-        return TurnedNight(all_of(Solution.failed(item, Status.POOR_FIT, str(error)) for item in items))
+        none = all_of(Solution.failed(item, Status.POOR_FIT, str(error)) for item in items)
+        return Calibrated(solver.instrument, math.inf, none), ()
     said = list(remarks.of_turn(found))
     if any(s.fix is not None for s in found.solutions):
         said.append(unnamed_inclinometer(solver.instrument))
-    return TurnedNight(all_of(found.solutions), found, tuple(filter(None, said)))
+    return replace(found, solutions=all_of(found.solutions)), tuple(filter(None, said))
 
 
 @dataclass(frozen=True)
