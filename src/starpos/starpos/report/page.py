@@ -63,33 +63,27 @@ def _picture(name: str, told: object, draw: "Callable[[Figure], None]", simulate
 def _figures(night: Night, catalogue: Catalogue) -> Iterator[_Figure]:
     draw = night_figures
     if night.fixed:
-        yield from _place_figures(night)
+        ground = (night.combined or night.places[0]).on_ground(night.vertical)
+        where = ground.latitude, ground.longitude, ground.covariance[:2, :2]
+        yield "map", "", lambda f: coast.draw_map(f, *where)
+        if night.steady is not None:
+            s = measures.steadiness(night, night.steady)
+            yield "stability", _outliers_told(s), lambda f: draw.draw_stability(f, s)
+        if len(night.fixed) > 1:
+            each = measures.stability(night)
+            yield "frames", _outliers_told(each), lambda f: draw.draw_stability(f, each)
+        yield "scatter", _scatter_told(night), lambda f: draw.draw_scatter(f, night)
+        if night.places[0].terms:
+            yield "budget", "", lambda f: draw.draw_budget(f, night)
         if (over := draw.overlaid(night)) is not None:
             yield _residuals(*over)
         if draw.views(night):
             yield "sky", draw.OUTLINES, lambda f: draw.draw_sky(f, night, catalogue)
-    if not night.shots:
-        return
     timed = [] if night.watched is None else draw.timed_of(night.watched.answers)
     if any(a.compared is not None for a in timed):
         yield "drive", _alarm_told(timed), lambda f: draw.draw_drive(f, timed)
-    yield "health", "", lambda f: draw.draw_health(f, night)
-
-
-def _place_figures(night: Night) -> Iterator[_Figure]:
-    draw = night_figures
-    ground = (night.combined or night.places[0]).on_ground(night.vertical)
-    where = ground.latitude, ground.longitude, ground.covariance[:2, :2]
-    yield "map", "", lambda f: coast.draw_map(f, *where)
-    if night.steady is not None:
-        s = measures.steadiness(night, night.steady)
-        yield "stability", _outliers_told(s), lambda f: draw.draw_stability(f, s)
-    if len(night.fixed) > 1:
-        each = measures.stability(night)
-        yield "frames", _outliers_told(each), lambda f: draw.draw_stability(f, each)
-    yield "scatter", _scatter_told(night), lambda f: draw.draw_scatter(f, night)
-    if night.places[0].terms:
-        yield "budget", "", lambda f: draw.draw_budget(f, night)
+    if night.shots:
+        yield "health", "", lambda f: draw.draw_health(f, night)
 
 
 def _alarm_told(timed: Sequence[Watched]) -> str:
