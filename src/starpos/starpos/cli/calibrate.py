@@ -109,10 +109,7 @@ def run_site(
     else:
         found = calibrate_at(solver, frames, tilts, site, options.turn_of(args), bar, known)
         console.complain(unnamed_inclinometer(instrument))
-    for solution in found.solutions:
-        if solution.fix is None:
-            console.complain(f"left out: {solution.message}")
-    console.complain(found.beyond)
+    console.complain(*(f"left out: {s.message}" for s in found.solutions if s.fix is None), found.beyond)
     about = _about_site(found, site)
     if args.misalignment is not None:
         about += _against(instrument.calibration, found.instrument.calibration)
@@ -124,9 +121,8 @@ def run_elevations(
 ) -> None:
     """Find A3's axis from pointings without a roll, write and print it; raises FixError if they do not determine it."""
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
-    for row in circles_of(solver, pointings, tilts):
-        if isinstance(row, StarposError):
-            console.complain(f"left out: {row}")
+    rows = circles_of(solver, pointings, tilts)
+    console.complain(*(f"left out: {row}" for row in rows if isinstance(row, StarposError)))
     site = options.camera_place_of(args)
     found = axis_of(solver, pointings, tilts, site=site)
     console.complain(of_left_out(found.left_out), unnamed_inclinometer(instrument))
@@ -505,18 +501,15 @@ def _draw(path: str, found: FromSky) -> None:
 
 def _json_of(found: FromSky, path: str) -> dict:
     fit = found.fit
-    c = fit.camera
+    c, names = fit.camera, parameters(fit.camera)
     return {
         "camera": path,
-        **{
-            name: getattr(c, name)
-            for name in ("width", "height", "fx", "fy", "cx", "cy", "model", "distortion")
-        },
-        "sigma": dict(zip(parameters(c), fit.sigma, strict=True)),
+        **console.values(c, "width height fx fy cx cy model distortion"),
+        "sigma": dict(zip(names, fit.sigma, strict=True)),
         "covariance": fit.covariance,
-        "told": [name for name, told in zip(parameters(c), fit.determined, strict=True) if told],
+        "told": [name for name, told in zip(names, fit.determined, strict=True) if told],
         "rms_before_px": rms(fit.before),
-        **{name: getattr(fit, name) for name in ("rms_px", "scatter_px", "worst_sigma_px", "rejected")},
+        **console.values(fit, "rms_px scatter_px worst_sigma_px rejected"),
         "stars": len(fit.xy),
         "frames": len(found.used),
     }

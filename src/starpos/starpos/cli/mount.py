@@ -72,7 +72,7 @@ def _circle(
 ) -> int:
     """Print the orientation of a horizontal circle."""
     there = [(path, a, readings[Path(path).name]) for path, a in seen if Path(path).name in readings]
-    for path in {Path(p).name for p, _ in seen} - set(readings):
+    for path in sorted({Path(p).name for p, _ in seen} - set(readings)):
         console.complain(f"{path}: {args.readings} has no reading of it: it is left out")
     if not there:
         raise FixError(

@@ -54,8 +54,7 @@ def run(args: argparse.Namespace) -> int:
     inputs.prepare(given, about)
     work = partial(read.on, partial(under_way.voyage_frame, given))
     frames = under_way.voyage_frames(answer for _, answer in inputs.worked(args, work, args.frames))
-    for frame in frames:
-        console.complain(frame.message)
+    console.complain(*(frame.message for frame in frames))
     voyage = under_way.voyage_of(frames, args.imu, args.velocity, vessel, console.ProgressBar())
     return tell(args, frames, voyage, vertical)
 

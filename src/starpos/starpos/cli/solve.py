@@ -185,8 +185,8 @@ def json_of_watched(answer: FrameAnswer) -> dict:
     if (at_place := solution.at_place) is not None:
         keys = fix_output.with_heading(keys, at_place, at_place.place)
     check = None if told is None else told.compared
-    about = ("status", "distance_m", "bearing_deg", "sigma_m")
-    return keys | {"gnss": None if check is None else {name: getattr(check, name) for name in about}}
+    about = None if check is None else console.values(check, "status distance_m bearing_deg sigma_m")
+    return keys | {"gnss": about}
 
 
 def run_pointings(args: argparse.Namespace) -> int:
