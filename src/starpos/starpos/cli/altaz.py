@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _pixels(seen: inputs.Seen, directions: np.ndarray) -> np.ndarray:
+def _pixels(seen: inputs.FrameAtPlace, directions: np.ndarray) -> np.ndarray:
     """Pixels (N, 2) of azimuths and altitudes (N, 2) in rad; NaN for those that are not on the frame."""
     xy = seen.camera.project(towards(*directions.T) @ seen.at_place.optics.rotation)
     with np.errstate(invalid="ignore"):
@@ -59,7 +59,7 @@ def _pixels(seen: inputs.Seen, directions: np.ndarray) -> np.ndarray:
     return np.where(np.asarray(on)[:, None], xy, np.nan)
 
 
-def _shown(seen: inputs.Seen, rays: np.ndarray) -> np.ndarray:
+def _shown(seen: inputs.FrameAtPlace, rays: np.ndarray) -> np.ndarray:
     """Whether identified stars lie as far off the axis as rays (N, 3) in C."""
     stars, found, used = seen.sight.stars, seen.sight.found, seen.at_place.used
     assert found is not None
@@ -68,7 +68,7 @@ def _shown(seen: inputs.Seen, rays: np.ndarray) -> np.ndarray:
     return REACH * np.arccos(np.clip(rays[:, 2], -1, 1)) <= np.arccos(np.clip(least, -1, 1))
 
 
-def _put(args: argparse.Namespace, seen: inputs.Seen, points: np.ndarray) -> None:
+def _put(args: argparse.Namespace, seen: inputs.FrameAtPlace, points: np.ndarray) -> None:
     """Print the azimuth and altitude of pixels (N, 2)."""
     output, found = console.Output(args, "pixels"), seen.at_place
     rays = seen.camera.directions(*points.T)
@@ -110,7 +110,7 @@ PNG_HEADER = 33
 GRID, FIGURES, LABELS = (120, 120, 40), (150, 90, 150), (0, 220, 255)
 
 
-def _figures(seen: inputs.Seen) -> Iterator[np.ndarray]:
+def _figures(seen: inputs.FrameAtPlace) -> Iterator[np.ndarray]:
     """Azimuths and altitudes (N, 2) in deg along the lines of the constellations, above the horizon."""
     at = seen.at_place
     state, to_local = earth_state(at.utc_unix_s), at.place.plumb_axes
@@ -127,7 +127,7 @@ def _figures(seen: inputs.Seen) -> Iterator[np.ndarray]:
                     yield np.degrees(np.stack([azimuth, altitude], -1))
 
 
-def _shade(picture: np.ndarray, seen: inputs.Seen, n: int, ground: np.ndarray) -> None:
+def _shade(picture: np.ndarray, seen: inputs.FrameAtPlace, n: int, ground: np.ndarray) -> None:
     """Darken the part of a picture (h, w, 3) below a horizon (N, 2) in deg."""
     y, x = np.mgrid[: picture.shape[0], : picture.shape[1]]
     xy = (np.stack([x.ravel(), y.ravel()], -1) + 0.5) * n - 0.5
@@ -137,7 +137,7 @@ def _shade(picture: np.ndarray, seen: inputs.Seen, n: int, ground: np.ndarray) -
     picture[below] = picture[below] // 3
 
 
-def _draw(path: str, seen: inputs.Seen, points: np.ndarray, ground: np.ndarray | None) -> None:
+def _draw(path: str, seen: inputs.FrameAtPlace, points: np.ndarray, ground: np.ndarray | None) -> None:
     """Draw the frame with stars, the grid, constellations and the points, the ground (N, 2) in deg darkened."""
     import cv2
 

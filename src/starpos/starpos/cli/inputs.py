@@ -76,7 +76,7 @@ def is_untold(args: argparse.Namespace) -> bool:
 
 
 @dataclass(frozen=True)
-class Seen:
+class FrameAtPlace:
     """A frame whose attitude at a known place is known, and its camera with the focal length that its stars show."""
 
     item: Frame | Stars
@@ -85,7 +85,7 @@ class Seen:
     camera: Camera
 
 
-def seen_at(args: argparse.Namespace, place: Place) -> Iterator[Seen]:
+def seen_at(args: argparse.Namespace, place: Place) -> Iterator[FrameAtPlace]:
     """Frames with their attitudes at a place.
 
     Frames without an attitude are complained about.  Raises StarposError as `solve` does.
@@ -112,7 +112,9 @@ def seen_at(args: argparse.Namespace, place: Place) -> Iterator[Seen]:
         instrument = sight.instrument or work.instruments.of(item)
         assert instrument is not None
         camera = instrument.camera_for(item.width, item.height, item.origin_px)
-        yield Seen(item, sight, at_place, camera.scaled(answer.found.focal_scale * at_place.focal_scale))
+        yield FrameAtPlace(
+            item, sight, at_place, camera.scaled(answer.found.focal_scale * at_place.focal_scale)
+        )
 
 
 def identifying(args: argparse.Namespace, frames: Sequence[str], read: Reader, search_s: float) -> Solving:

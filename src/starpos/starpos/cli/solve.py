@@ -214,7 +214,8 @@ def run_pointings(args: argparse.Namespace) -> int:
         solved = iter(found.solutions)
         solutions = [next(solved) if p.has_roll else solver.solve_pointing(p) for p in pointings]
     each = (FrameAnswer(p.source, s) for p, s in zip(pointings, solutions, strict=True))
-    return tell(args, output, None, NightAnswers(each, given=given, turned=found, remarks=said), vertical)
+    answers = NightAnswers(each=each, given=given, turned=found, remarks=said)
+    return tell(args, output, None, answers, vertical)
 
 
 def _from_elevations(

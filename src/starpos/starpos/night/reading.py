@@ -61,7 +61,7 @@ class Reader:
         return first
 
     def one_of(self, paths: Sequence[str]) -> Stars:
-        """As `first`; raises the FrameError of the first path if none can be read."""
+        """The star list as by `first`; raises the FrameError of the first path if none can be read."""
         about = self.first(paths)
         if about is None:
             self(paths[0])

@@ -87,7 +87,7 @@ class How:
 ONE_BY_ONE = How()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class NightAnswers:
     """The answers of a night; each: one for each frame, in order, as soon as it is there.
 
@@ -114,21 +114,21 @@ def answers_of(
     """Answer the frames of a night, by name; sights: what `how.work(asked)` gave of each."""
     if how.one_by_one:
         known = asked.instruments.instrument
-        return NightAnswers(_without_lamps(_one_by_one(sights, asked)), known, known)
+        return NightAnswers(each=_without_lamps(_one_by_one(sights, asked)), instrument=known, given=known)
     rows = list(sights)
     seen = [sight for _, sight in rows if isinstance(sight, Sight)]
     if not seen:
-        return NightAnswers(_in_order(rows, ()))
+        return NightAnswers(each=_in_order(rows, ()))
     solver = replace(asked.solver(seen[0].stars), progress=progress)
     solver, alike = of_one_camera(solver, seen)
     if how.gnss is not None:
         watched = _watched_night(solver, alike, asked.tilts, how.gnss, how.learned, vertical)
         each = _in_order(rows, ((a.solution, a) for a in watched.answers))
-        return NightAnswers(each, solver.instrument, watched=watched, remarks=watched.remarks)
+        return NightAnswers(each=each, instrument=solver.instrument, watched=watched, remarks=watched.remarks)
     assert how.turn_stddev_deg is not None
     found, said = turned(solver, alike, asked.tilts or NO_TILTS, how.turn_stddev_deg)
     each = _in_order(rows, ((s, None) for s in found.solutions))
-    return NightAnswers(each, found.instrument, turned=found, remarks=said)
+    return NightAnswers(each=each, instrument=found.instrument, turned=found, remarks=said)
 
 
 def _one_by_one(sights: Iterable[tuple[str, Sight | FrameError]], asked: Solving) -> Iterator[FrameAnswer]:
