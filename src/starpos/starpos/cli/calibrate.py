@@ -237,7 +237,8 @@ def run(args: argparse.Namespace) -> int:
     # an unusable instrument is refused before the work on all frames
     if not given.sought:
         check_output(args, given.instrument)
-    sights, unreadable = _sights(args.frames, read, given)
+    sights = _sights(args.frames, read, given)
+    unreadable = len(sights) < len(args.frames)
     solver, alike = of_one_camera(Solver(given.instrument, catalogue.load_catalogue()), sights)
     frames = [sight.stars for sight in alike]
     known = {n: sight.found for n, sight in enumerate(alike) if sight.found is not None}
@@ -342,10 +343,9 @@ def _from_pointings(args: argparse.Namespace) -> int:
     return 0
 
 
-def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> tuple[list[Sight], bool]:
-    """The frames that can be read, identified by every way there is, and whether some cannot be read."""
-    progress, unreadable, work = console.ProgressBar(), False, Solving(given)
-    sights: list[Sight] = []
+def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> list[Sight]:
+    """The frames that can be read, identified by every way there is; complaints about the others."""
+    progress, work, sights = console.ProgressBar(), Solving(given), list[Sight]()
     for k, path in enumerate(paths):
         try:
             sight = work(read(path))
@@ -353,9 +353,8 @@ def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> tuple[lis
             console.complain(sight.solution.remark)
         except FrameError as e:
             console.complain(e)
-            unreadable = True
         progress("frames", (k + 1) / len(paths))
-    return sights, unreadable
+    return sights
 
 
 def _camera(

@@ -304,9 +304,8 @@ def draw_drive(figure: "Figure", timed: Sequence[Watched]) -> None:
 
 def _draw_map(axes: "Axes", timed: Sequence[Watched]) -> None:
     plain(axes)
-    places = [a.compared.place for a in timed if a.compared is not None]
     grounds = [a.ground for a in timed if a.ground is not None]
-    first = places[0] if places else grounds[0]
+    first = next(a.compared.place for a in timed if a.compared is not None)
 
     def km(latitude: float, longitude: float) -> np.ndarray:
         here = Place.on_ellipsoid(*np.degrees([latitude, longitude]).tolist())
