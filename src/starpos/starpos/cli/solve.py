@@ -228,16 +228,14 @@ def _from_elevations(
     near: Near | None,
 ) -> int:
     """Print each row's zenith distance and the place that they give together; returns the exit status."""
-    found, saving = from_elevations(solver, pointings, tilts, near, args.self_calibrate), 0
-    status = fix_output.tell_elevations(
-        args, output, pointings, found.circles, found.together, vertical, near
-    )
-    if found.axis is not None:
+    circles, whole = from_elevations(solver, pointings, tilts, near, args.self_calibrate)
+    status, saving = fix_output.tell_elevations(args, output, pointings, circles, whole, vertical, near), 0
+    if whole.axis is not None:
         console.complain(
-            f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec"
+            f"A3 from the elevations: the frame's centre in the inclinometer to {whole.axis.stddev_arcsec:.0f} arcsec"
         )
     if args.save is not None:
-        saving = _save_axis(args, solver, found.axis)
+        saving = _save_axis(args, solver, whole.axis)
     return max(saving, status)
 
 

@@ -104,11 +104,15 @@ class Gathered:
 
 @dataclass(frozen=True)
 class Together:
-    """The average of a night's fixes, None if it is missing, as why_not says; and remarks on it."""
+    """The average of a night's fixes, None if it is missing, as why_not says; and remarks on it.
+
+    axis: A3's, which elevations determined too; None if A3 was known well enough or they do not determine it.
+    """
 
     average: Average | None = None
     why_not: str = ""
     remarks: tuple[str, ...] = ()
+    axis: FoundAxis | None = None
 
     @classmethod
     def by_circles(cls, place: Average, near: Near | None) -> "Together":
@@ -189,26 +193,14 @@ def turned(
     return replace(found, solutions=all_of(found.solutions)), tuple(filter(None, said))
 
 
-@dataclass(frozen=True)
-class Elevations:
-    """Each pointing's circle on which its place lies, or the error; the place of all.
-
-    axis: A3 whose axis the elevations determined too; None if A3 was known well enough or they do not determine it.
-    """
-
-    circles: tuple[Circle | StarposError, ...]
-    together: Together
-    axis: FoundAxis | None = None
-
-
 def from_elevations(
     solver: Solver,
     pointings: Sequence[Pointing],
     tilts: Tilts,
     near: Near | None = None,
     self_calibrate: bool = False,
-) -> Elevations:
-    """Find the place of pointings, and A3's axis where it is not known to a few arcmin.
+) -> tuple[list[Circle | StarposError], Together]:
+    """Each pointing's circle, or the error, and their place; A3's axis where it is not known to a few arcmin.
 
     near: selects between two places that the elevations leave. self_calibrate: treat A3 as unknown.
     """
@@ -218,7 +210,7 @@ def from_elevations(
     circles = circles_of(solver, pointings, tilts)
     sound = [c for c in circles if isinstance(c, Circle)]
     if not sound:
-        return Elevations(tuple(circles), Together())
+        return circles, Together()
     there, axis = near and near.place, None
     try:
         directions = Directions.of(sorted(sound, key=lambda c: c.utc_unix_s))
@@ -234,19 +226,17 @@ def from_elevations(
             unnamed_inclinometer(solver.instrument),
             *doubts((), place, None, near),
         )
-        together = Together(place, "", tuple(filter(None, said)))
+        whole = Together(place, "", tuple(filter(None, said)), axis)
     except FixError as error:
-        together = Together(None, str(error))
-    found = Elevations(tuple(circles), together, axis)
-    if self_calibrate or axis is not None or not remarks.beyond_stated(together.average):
-        return found
+        whole = Together(None, str(error), axis=axis)
+    if self_calibrate or axis is not None or not remarks.beyond_stated(whole.average):
+        return circles, whole
     # residuals beyond the stated errors may come from a wrong A3, which no scatter covers
     given = solver.instrument.calibration
-    free = from_elevations(solver, pointings, tilts, near, self_calibrate=True)
+    _, free = from_elevations(solver, pointings, tilts, near, self_calibrate=True)
     if free.axis is None or free.axis.directions < MIN_JUDGED or free.axis.sigma_from(given) < DENIED_SIGMA:
-        return found
-    said = (remarks.of_denied_a3(free.axis, given), *free.together.remarks)
-    return replace(free, circles=tuple(circles), together=replace(free.together, remarks=said))
+        return circles, whole
+    return circles, replace(free, remarks=(remarks.of_denied_a3(free.axis, given), *free.remarks))
 
 
 def axis_of(
