@@ -20,7 +20,7 @@ MAX_LATITUDE_DEG = 45.0
 DRAWN = ("-n", "4", "--size", "2808", "1872")
 # of the drawn instrument
 A3 = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
-LEVEL = ("--inclinometer", "sca100t_calibrated")
+KNOWN = (*A3, "--inclinometer", "sca100t_calibrated")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -63,7 +63,7 @@ def _night(folder: Path, place_deg: tuple[float, float], rng: np.random.Generato
     )
     if status := main(["simulate", night, *DRAWN, *place]):
         return status
-    return night, *A3, *LEVEL
+    return night, *KNOWN
 
 
 def _photographs(folder: Path, place_deg: tuple[float, float], rng: np.random.Generator) -> tuple[str, ...]:
