@@ -111,7 +111,6 @@ class FrameComplaints:
                 last = f", the last is {others[-1]}" if len(others) > 1 else ""
                 frames = "1 more frame" if len(others) == 1 else f"{len(others)} more frames"
                 complain(f"the same as of {first} ({start} ...) is true of {frames}{last}")
-        self._frames.clear()
 
 
 class ProgressBar:
@@ -119,14 +118,12 @@ class ProgressBar:
 
     def __init__(self) -> None:
         self.begin = time.monotonic()
-        self.shown = False
 
     def __call__(self, what: str, done: float) -> None:
-        soon = time.monotonic() - self.begin < BAR_AFTER_S and not self.shown
+        soon = time.monotonic() - self.begin < BAR_AFTER_S
         # several processes would write over each other's
         if soon or not sys.stderr.isatty() or parent_process() is not None:
             return
-        self.shown = True
         filled = int(30 * min(done, 1.0))
         end = "\n" if done >= 1 else ""
         print(
