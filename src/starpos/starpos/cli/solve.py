@@ -270,7 +270,8 @@ def _run_sights(args: argparse.Namespace) -> int:
     if sound:
         try:
             used, seen = zip(*sound, strict=True)
-            whole = Together.by_circles(place_of_sights(used, seen, near and near.place), near)
+            place = place_of_sights(used, seen, None if near is None else near.place)
+            whole = Together.by_circles(place, near)
         except StarposError as error:
             whole = Together(None, str(error))
     return fix_output.tell_elevations(args, output, sights, circles, whole, vertical, near)

@@ -87,8 +87,9 @@ class Gathered:
             if stars is not None and stars.gps_deg is not None and self.mark is None:
                 self.mark = Near(*np.radians(stars.gps_deg).tolist())
             if stars is not None and stars.site_deg is not None and self.site is None:
+                latitude, longitude = np.radians(stars.site_deg).tolist()
                 stated_by = f"the header's {stars.site_cards}"
-                self.site = Near(*np.radians(stars.site_deg).tolist(), stated_by=stated_by, either_sign=True)
+                self.site = Near(latitude, longitude, stated_by=stated_by, either_sign=True)
         if s.at_place:
             self.headings.append(s)
         if s.circle is not None:
@@ -158,7 +159,7 @@ def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
                 "the Sun's elevations determine a place only where A3 is known to 6 arcmin: find it by night with "
                 "starpos calibrate --site"
             )
-        place, _ = place_of_discs(circles, near and near.place)
+        place, _ = place_of_discs(circles, None if near is None else near.place)
     except FixError as error:
         return Together(None, str(error))
     return Together.by_circles(place, near)
@@ -211,7 +212,7 @@ def from_elevations(
     sound = [c for c in circles if isinstance(c, Circle)]
     if not sound:
         return circles, Together()
-    there, axis = near and near.place, None
+    there, axis = None if near is None else near.place, None
     try:
         directions = Directions.of(sorted(sound, key=lambda c: c.utc_unix_s))
         if self_calibrate or (directions.wide and len(directions.circles) >= MIN_WITHOUT_SITE):

@@ -208,10 +208,12 @@ def draw_health(figure: "Figure", night: Night) -> None:
     panels = figure.subplots(4, 1, sharex=True)
     mark, size = ("o", 3.5) if len(shots) <= MANY else (".", 2.5)
 
+    points: dict[str, Any] = {"ms": size, "ls": "none", "marker": mark}
+
     def draw(
         axes: "Axes", values: Sequence[float] | np.ndarray, colour: str, label: str = "", **more: Any
     ) -> None:
-        axes.plot(at, values, color=colour, label=label, **{"ms": size, "ls": "none", "marker": mark} | more)
+        axes.plot(at, values, color=colour, label=label, **points | more)
 
     draw(panels[0], [s.stars_detected for s in shots], ORANGE, "detected", ms=1.8 * size, mfc="none")
     draw(panels[0], [s.stars_matched for s in shots], BLUE, "in the fix")
