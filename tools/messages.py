@@ -19,7 +19,7 @@ NODES = (
     "src/starpos_dashboard",
 )
 # Calls whose texts people read: diagnostics, warnings of nodes, remarks of commands.
-SHOWN = {"Diagnosis", "Finding", "warning", "warn", "complain", "refuse", "_say", "failed"}
+SHOWN = {"Diagnosis", "ok", "note", "missing", "warning", "warn", "complain", "refuse", "_say", "failed"}
 # A sentence has at least this number of words, and for each value this number: others are parts, or lines of results.
 MIN_WORDS, MIN_WORDS_A_VALUE = 4, 1.5
 GAP = "…"

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from starpos import __version__
-from starpos.errors import StarposError
+from starpos.errors import FixError, StarposError
 from starpos.parallel import BLAS_THREADS
 
-BAD_CALL = 2
+# exit status: no answer; a bad call, or input that cannot be read
+NOTHING, BAD_CALL = 1, 2
 # the commands in the order of --help, which needs nothing else of them
 COMMANDS = dict(
     line.split(": ", 1)
@@ -142,7 +143,8 @@ def _run(
         return status
     except StarposError as e:
         complain(e)
-        return BAD_CALL
+        # stars that do not support a fix are no bad input
+        return NOTHING if isinstance(e, FixError) else BAD_CALL
     # the reader of our output has gone, as in `starpos ... | head`
     except BrokenPipeError:
         drop_output()

@@ -6,7 +6,6 @@ import itertools
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,12 +15,8 @@ from starpos.cli.commands import DATA
 from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, InstrumentError
 from starpos.files import rows_of, save
-from starpos.fix.attitude import Attitude
 from starpos.fix.directions import horizontal, towards
-from starpos.fix.heading import AttitudeAtPlace
-from starpos.fix.searching import Sight
-from starpos.frames.frame import Frame, Stars
-from starpos.instrument.camera import Camera
+from starpos.frames.frame import Frame
 from starpos.night import horizon
 from starpos.tables import TableForm
 from starpos.units import utc_text
@@ -41,12 +36,11 @@ def run(args: argparse.Namespace) -> int:
     if args.points is not None:
         table = POINTS.read(args.points)
         pixels = np.vstack([pixels, np.stack([table.columns["x"], table.columns["y"]], -1)])
-    answers = list(inputs.seen_at(args, options.camera_place_of(args)))
-    if not answers:
+    seen = next(inputs.seen_at(args, options.camera_place_of(args)), None)
+    if seen is None:
         return console.NOTHING
-    seen = _Seen(*answers[0])
     back = np.radians(np.reshape(args.back, (-1, 2)))
-    backs = seen.pixels(back)
+    backs = _pixels(seen, back)
     for (az, alt), xy in zip(np.degrees(back).tolist(), backs.tolist(), strict=True):
         if not np.isfinite(xy).all():
             console.complain(f"azimuth {az:g}, altitude {alt:g} deg is not on the frame")
@@ -57,48 +51,32 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """A frame whose attitude at a known place is known, and its camera with the focal length that its stars show."""
-
-    item: Frame | Stars
-    sight: Sight
-    camera: Camera
-
-    @property
-    def at_place(self) -> AttitudeAtPlace:
-        assert self.sight.solution.at_place is not None
-        return self.sight.solution.at_place
-
-    @property
-    def optics(self) -> Attitude:
-        return self.at_place.optics
-
-    def pixels(self, directions: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of azimuths and altitudes (N, 2) in rad; NaN for those that are not on the frame."""
-        xy = self.camera.project(towards(*directions.T) @ self.optics.rotation)
-        with np.errstate(invalid="ignore"):
-            on = ((xy > -0.5) & (xy < np.array([self.camera.width, self.camera.height]) - 0.5)).all(1)
-        return np.where(np.asarray(on)[:, None], xy, np.nan)
-
-    def shown(self, rays: np.ndarray) -> np.ndarray:
-        """Whether identified stars lie as far off the axis as rays (N, 3) in C."""
-        stars, found, used = self.sight.stars, self.sight.found, self.at_place.used
-        assert found is not None
-        row = found.star[used]
-        least = self.camera.directions(stars.x[row], stars.y[row])[:, 2].min()
-        return REACH * np.arccos(np.clip(rays[:, 2], -1, 1)) <= np.arccos(np.clip(least, -1, 1))
+def _pixels(seen: inputs.FrameAtPlace, directions: np.ndarray) -> np.ndarray:
+    """Pixels (N, 2) of azimuths and altitudes (N, 2) in rad; NaN for those that are not on the frame."""
+    xy = seen.camera.project(towards(*directions.T) @ seen.at_place.optics.rotation)
+    with np.errstate(invalid="ignore"):
+        on = ((xy > -0.5) & (xy < np.array([seen.camera.width, seen.camera.height]) - 0.5)).all(1)
+    return np.where(np.asarray(on)[:, None], xy, np.nan)
 
 
-def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
+def _shown(seen: inputs.FrameAtPlace, rays: np.ndarray) -> np.ndarray:
+    """Whether identified stars lie as far off the axis as rays (N, 3) in C."""
+    stars, found, used = seen.sight.stars, seen.sight.found, seen.at_place.used
+    assert found is not None
+    row = found.star[used]
+    least = seen.camera.directions(stars.x[row], stars.y[row])[:, 2].min()
+    return REACH * np.arccos(np.clip(rays[:, 2], -1, 1)) <= np.arccos(np.clip(least, -1, 1))
+
+
+def _put(args: argparse.Namespace, seen: inputs.FrameAtPlace, points: np.ndarray) -> None:
     """Print the azimuth and altitude of pixels (N, 2)."""
     output, found = console.Output(args, "pixels"), seen.at_place
     rays = seen.camera.directions(*points.T)
     sigma = np.hypot(args.stddev_px, found.jitter_px) / seen.camera.fx
-    at = horizontal(seen.optics, rays, sigma)
-    airless = options.atmosphere_of(args).refraction().unbend(rays @ seen.optics.rotation.T)
+    at = horizontal(seen.at_place.optics, rays, sigma)
+    airless = options.atmosphere_of(args).refraction().unbend(rays @ seen.at_place.optics.rotation.T)
     errors = np.degrees(np.sqrt(np.diagonal(at.covariance, axis1=1, axis2=2))) * 3600
-    errors[~seen.shown(rays)] = np.nan
+    errors[~_shown(seen, rays)] = np.nan
     if np.isnan(errors).any():
         console.complain(
             f"{int(np.isnan(errors[:, 0]).sum())} points lie further out than any identified star, where the lens is not "
@@ -132,7 +110,7 @@ PNG_HEADER = 33
 GRID, FIGURES, LABELS = (120, 120, 40), (150, 90, 150), (0, 220, 255)
 
 
-def _figures(seen: _Seen) -> Iterator[np.ndarray]:
+def _figures(seen: inputs.FrameAtPlace) -> Iterator[np.ndarray]:
     """Azimuths and altitudes (N, 2) in deg along the lines of the constellations, above the horizon."""
     at = seen.at_place
     state, to_local = earth_state(at.utc_unix_s), at.place.plumb_axes
@@ -149,17 +127,17 @@ def _figures(seen: _Seen) -> Iterator[np.ndarray]:
                     yield np.degrees(np.stack([azimuth, altitude], -1))
 
 
-def _shade(picture: np.ndarray, seen: _Seen, n: int, ground: np.ndarray) -> None:
+def _shade(picture: np.ndarray, seen: inputs.FrameAtPlace, n: int, ground: np.ndarray) -> None:
     """Darken the part of a picture (h, w, 3) below a horizon (N, 2) in deg."""
     y, x = np.mgrid[: picture.shape[0], : picture.shape[1]]
     xy = (np.stack([x.ravel(), y.ravel()], -1) + 0.5) * n - 0.5
-    v = seen.camera.directions(*xy.T) @ seen.optics.rotation.T
+    v = seen.camera.directions(*xy.T) @ seen.at_place.optics.rotation.T
     edge = np.interp(np.degrees(np.arctan2(v[:, 0], v[:, 1])), ground[:, 0], ground[:, 1], period=360)
     below = (np.degrees(np.arcsin(np.clip(v[:, 2], -1, 1))) < edge).reshape(picture.shape[:2])
     picture[below] = picture[below] // 3
 
 
-def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None) -> None:
+def _draw(path: str, seen: inputs.FrameAtPlace, points: np.ndarray, ground: np.ndarray | None) -> None:
     """Draw the frame with stars, the grid, constellations and the points, the ground (N, 2) in deg darkened."""
     import cv2
 
@@ -177,7 +155,7 @@ def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None)
 
     def line(directions: np.ndarray) -> np.ndarray:
         """Points (N, 2) of the picture where azimuths and altitudes (N, 2) in deg are."""
-        return (seen.pixels(np.radians(directions)) + 0.5) / n - 0.5
+        return (_pixels(seen, np.radians(directions)) + 0.5) / n - 0.5
 
     if ground is not None:
         _shade(picture[: seen.camera.height // n], seen, n, ground)

@@ -26,7 +26,7 @@ from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn, unnamed_inc
 from starpos.fix.heading import confirms_hour
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
-from starpos.frames.frame import Frame, Stars
+from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
 from starpos.frames.tables import TILTS, Pointing, read_pointings
 from starpos.instrument import instrument_file, platepar
@@ -35,12 +35,11 @@ from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import SAG_ARCSEC_PER_SQRT_HOUR, Calibration, Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.night import horizon
-from starpos.night.extinction import light_of
 from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, Instruments, Reader
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_left_out
 from starpos.night.together import axis_of, circles_of
-from starpos.night.watching import Answer, kept, night_poses, sky_mag
+from starpos.night.watching import Answer, kept, night_poses
 from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import ARCSEC
@@ -110,10 +109,7 @@ def run_site(
     else:
         found = calibrate_at(solver, frames, tilts, site, options.turn_of(args), bar, known)
         console.complain(unnamed_inclinometer(instrument))
-    for solution in found.solutions:
-        if solution.fix is None:
-            console.complain(f"left out: {solution.message}")
-    console.complain(found.beyond)
+    console.complain(*(f"left out: {s.message}" for s in found.solutions if s.fix is None), found.beyond)
     about = _about_site(found, site)
     if args.misalignment is not None:
         about += _against(instrument.calibration, found.instrument.calibration)
@@ -125,9 +121,8 @@ def run_elevations(
 ) -> None:
     """Find A3's axis from pointings without a roll, write and print it; raises FixError if they do not determine it."""
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
-    for row in circles_of(solver, pointings, tilts):
-        if isinstance(row, StarposError):
-            console.complain(f"left out: {row}")
+    rows = circles_of(solver, pointings, tilts)
+    console.complain(*(f"left out: {row}" for row in rows if isinstance(row, StarposError)))
     site = options.camera_place_of(args)
     found = axis_of(solver, pointings, tilts, site=site)
     console.complain(of_left_out(found.left_out), unnamed_inclinometer(instrument))
@@ -242,7 +237,8 @@ def run(args: argparse.Namespace) -> int:
     # an unusable instrument is refused before the work on all frames
     if not given.sought:
         check_output(args, given.instrument)
-    sights, unreadable = _sights(args.frames, read, given)
+    sights = _sights(args.frames, read, given)
+    unreadable = len(sights) < len(args.frames)
     solver, alike = of_one_camera(Solver(given.instrument, catalogue.load_catalogue()), sights)
     frames = [sight.stars for sight in alike]
     known = {n: sight.found for n, sight in enumerate(alike) if sight.found is not None}
@@ -278,16 +274,10 @@ def _watch(args: argparse.Namespace) -> int:
     overwriting.check(args, page=overwriting.ours, horizon=overwriting.never)
     site = options.camera_place_of(args)
     answers, stars = [], []
-    for item, sight, camera in inputs.seen_at(args, site):
-        found = sight.solution
-        assert found.at_place is not None
-        sky = sky_mag(item, sight.stars, found, camera) if isinstance(item, Frame) else np.nan
-        light, number = light_of(sight.stars, found, camera), len(found.names)
-        answers.append(
-            Answer(at_place=found.at_place, stars=number, focal_px=camera.fx, light=light, sky_mag=sky)
-        )
+    for seen in inputs.seen_at(args, site):
+        answers.append(Answer.of(seen.item, seen.sight, seen.camera))
         if args.horizon is not None:
-            stars.append(horizon.expected(sight, camera, catalogue.load_catalogue()))
+            stars.append(horizon.expected(seen.sight, seen.camera, catalogue.load_catalogue()))
     nights = kept(night_poses(answers, site.longitude))
     for k, night in enumerate(nights):
         values = watch_output.values_of(night)
@@ -346,21 +336,16 @@ def _from_pointings(args: argparse.Namespace) -> int:
     instrument = options.instrument_of(args, NO_CAMERA)
     check_output(args, instrument)
     tilts = None if args.tilt is None else checked_tilts(args.tilt, instrument).log
-    try:
-        if elevations and tilts is not None:
-            run_elevations(args, elevations, instrument, tilts)
-        else:
-            run_site(args, whole, instrument, tilts)
-    except FixError as e:
-        console.complain(e)
-        return console.NOTHING
+    if elevations and tilts is not None:
+        run_elevations(args, elevations, instrument, tilts)
+    else:
+        run_site(args, whole, instrument, tilts)
     return 0
 
 
-def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> tuple[list[Sight], bool]:
-    """The frames that can be read, identified by every way there is, and whether some cannot be read."""
-    progress, unreadable, work = console.ProgressBar(), False, Solving(given)
-    sights: list[Sight] = []
+def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> list[Sight]:
+    """The frames that can be read, identified by every way there is; complaints about the others."""
+    progress, work, sights = console.ProgressBar(), Solving(given), list[Sight]()
     for k, path in enumerate(paths):
         try:
             sight = work(read(path))
@@ -368,9 +353,8 @@ def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> tuple[lis
             console.complain(sight.solution.remark)
         except FrameError as e:
             console.complain(e)
-            unreadable = True
         progress("frames", (k + 1) / len(paths))
-    return sights, unreadable
+    return sights
 
 
 def _camera(
@@ -516,18 +500,15 @@ def _draw(path: str, found: FromSky) -> None:
 
 def _json_of(found: FromSky, path: str) -> dict:
     fit = found.fit
-    c = fit.camera
+    c, names = fit.camera, parameters(fit.camera)
     return {
         "camera": path,
-        **{
-            name: getattr(c, name)
-            for name in ("width", "height", "fx", "fy", "cx", "cy", "model", "distortion")
-        },
-        "sigma": dict(zip(parameters(c), fit.sigma, strict=True)),
+        **console.values(c, "width height fx fy cx cy model distortion"),
+        "sigma": dict(zip(names, fit.sigma, strict=True)),
         "covariance": fit.covariance,
-        "told": [name for name, told in zip(parameters(c), fit.determined, strict=True) if told],
+        "told": [name for name, told in zip(names, fit.determined, strict=True) if told],
         "rms_before_px": rms(fit.before),
-        **{name: getattr(fit, name) for name in ("rms_px", "scatter_px", "worst_sigma_px", "rejected")},
+        **console.values(fit, "rms_px scatter_px worst_sigma_px rejected"),
         "stars": len(fit.xy),
         "frames": len(found.used),
     }

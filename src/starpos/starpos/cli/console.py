@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from starpos import cli
 from starpos.files import rows_of
 
 OUTPUTS = Path(__file__).with_name("data") / "outputs.yaml"
-# Exit status: no answer; input that cannot be read.
-NOTHING, UNREADABLE = 1, 2
+NOTHING, UNREADABLE = cli.NOTHING, cli.BAD_CALL
 # s of work that needs no bar
 BAR_AFTER_S = 0.5
 
@@ -79,6 +79,16 @@ def complain(*said: object) -> None:
         print(f"starpos {_speaking.get()}: {each}", file=sys.stderr)
 
 
+def complain_of(night: str | None, *said: object) -> None:
+    """Complain about a night; None where it is not named."""
+    complain(*(each if night is None else f"{night}: {each}" for each in said if each))
+
+
+def named(name: str, said: str) -> str:
+    """A sentence on a frame, with its name before it unless it is in it."""
+    return said if name in said else f"{name}: {said}"
+
+
 class FrameComplaints:
     """Complains about frames: a sentence that is true of several, but for their names, is printed once."""
 
@@ -91,7 +101,7 @@ class FrameComplaints:
         alike = self._frames.setdefault(reason, [])
         alike.append(name)
         if len(alike) == 1:
-            complain(error if name in str(error) else f"{name}: {error}")
+            complain(named(name, str(error)))
 
     def end(self) -> None:
         """Say how many more frames each sentence is true of."""
@@ -101,7 +111,6 @@ class FrameComplaints:
                 last = f", the last is {others[-1]}" if len(others) > 1 else ""
                 frames = "1 more frame" if len(others) == 1 else f"{len(others)} more frames"
                 complain(f"the same as of {first} ({start} ...) is true of {frames}{last}")
-        self._frames.clear()
 
 
 class ProgressBar:
@@ -109,14 +118,12 @@ class ProgressBar:
 
     def __init__(self) -> None:
         self.begin = time.monotonic()
-        self.shown = False
 
     def __call__(self, what: str, done: float) -> None:
-        soon = time.monotonic() - self.begin < BAR_AFTER_S and not self.shown
+        soon = time.monotonic() - self.begin < BAR_AFTER_S
         # several processes would write over each other's
         if soon or not sys.stderr.isatty() or parent_process() is not None:
             return
-        self.shown = True
         filled = int(30 * min(done, 1.0))
         end = "\n" if done >= 1 else ""
         print(

@@ -9,14 +9,15 @@ import numpy as np
 
 from starpos.cli import console, inputs, options
 from starpos.earth.place import Place
-from starpos.errors import FixError, FrameError, InstrumentError, TiltError
+from starpos.earth.vertical import Deflection
+from starpos.errors import FrameError, InstrumentError, TiltError
 from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.solution import Solution
 from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilt_log import TiltLog
 from starpos.night.at_mark import zenith_seen
-from starpos.night.bag import each_frame, is_bag
+from starpos.night.bag import is_bag
 from starpos.night.opening import work_of
-from starpos.night.work import Solving
 from starpos.units import ARCSEC, utc_text
 from starpos.zenith.adjustment import DeflectionSession, FaceQuality, reduced
 from starpos.zenith.doubts import checked_session, remarks
@@ -123,8 +124,8 @@ def run(args: argparse.Namespace) -> int:
     return _tell(args, _of_bag(args, mark) if _is_bag(args) else _of_files(args, mark), mark)
 
 
-# names of a session's frames, their sightings or the errors, and the instrument
-_Taken = tuple[list[str], list[ZenithSighting | Solution | FrameError], Instrument]
+# a session's frames, each by name with its sighting or why it has none; the instrument
+_Taken = tuple[list[tuple[str, ZenithSighting | Solution | FrameError]], Instrument]
 
 
 def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
@@ -132,19 +133,15 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
     if not args.frames or args.tilt is None:
         raise InstrumentError("give frames and --tilt CSV, or a bag")
     read, frames = inputs.reader_of(args), inputs.frames_among(args.frames, args.tilt)
-    about = read.first(frames)
-    if about is None:
-        # says why
-        read(frames[0])
-    assert about is not None
+    about = read.one_of(frames)
     air = options.atmosphere_of(args)
     given, remarks = work_of(inputs.given_of(args, about), about, Path(args.tilt), air)
     console.complain(*remarks)
     instrument = given.instruments.instrument
     assert instrument is not None
-    inputs.prepare(instrument, about)
+    inputs.prepare(given.instruments, about)
     work = partial(read.on, partial(zenith_seen, given, mark))
-    return frames, list(inputs.worked(args, work, frames, lines=False)), instrument
+    return list(inputs.worked(args, work, frames, lines=False)), instrument
 
 
 def _is_bag(args: argparse.Namespace) -> bool:
@@ -159,35 +156,26 @@ def _is_bag(args: argparse.Namespace) -> bool:
 def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
     """The sightings of a bag's frames."""
     path = Path(args.frames[0])
-    found, instruments = inputs.read_bag(path, args)
-    console.complain(*found.remarks)
-    if found.tilts is None:
+    night = inputs.bag_of(path, args, Deflection())
+    console.complain(*night.remarks)
+    if not isinstance(night.work.tilts, TiltLog):
         raise TiltError(f"{path}: no usable tilt in it: record the topic tilt too")
-    if not found.star_count:
+    if not night.count:
         raise FrameError(f"{path}: no stars and no images in it: record the topic stars too")
-    given = Solving(instruments, atmosphere=options.atmosphere_of(args), tilts=found.tilts)
-    names, answers = [], []
-    for name, item in inputs.watched(each_frame(found), found.star_count, lines=False):
-        names.append(name)
-        answers.append(item if isinstance(item, FrameError) else zenith_seen(given, mark, item))
-    assert instruments.instrument is not None
-    return names, answers, instruments.instrument
+    answers = night.each(partial(zenith_seen, night.work, mark))
+    assert night.work.instruments.instrument is not None
+    return list(inputs.watched(answers, night.count, lines=False)), night.work.instruments.instrument
 
 
 def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
     """Adjust the session and print it; returns the exit status."""
-    output, (names, answers, instrument) = console.Output(args, "deflection"), taken
+    output, (rows, instrument) = console.Output(args, "deflection"), taken
     console.complain(unnamed_inclinometer(instrument))
-    rows = list(zip(names, answers, strict=True))
     for name, answer in rows:
         if not isinstance(answer, ZenithSighting):
             console.complain(_why(name, answer))
-    sightings = [answer for answer in answers if isinstance(answer, ZenithSighting)]
-    try:
-        session = checked_session(sightings, instrument, options.atmosphere_of(args), mark)
-    except FixError as error:
-        console.complain(error)
-        return console.NOTHING
+    sightings = [answer for _, answer in rows if isinstance(answer, ZenithSighting)]
+    session = checked_session(sightings, instrument, options.atmosphere_of(args), mark)
     console.complain(*remarks(session, len(rows), instrument.inclinometer.scale))
     at = {id(s): k for k, s in enumerate(session.sightings)}
     for name, answer in rows:
@@ -199,7 +187,7 @@ def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
     without = reduced(session, mark)
     whole = combined_json(session, without, mark, args.station)
     output.put(whole, combined_text(session, whole))
-    return console.UNREADABLE if any(isinstance(a, FrameError) for a in answers) else 0
+    return console.UNREADABLE if any(isinstance(a, FrameError) for _, a in rows) else 0
 
 
 def _mark_of(args: argparse.Namespace) -> Place:
@@ -212,5 +200,4 @@ def _mark_of(args: argparse.Namespace) -> Place:
 
 
 def _why(path: str, answer: Solution | FrameError) -> str:
-    said = str(answer) if isinstance(answer, FrameError) else answer.message
-    return said if path in said else f"{path}: {said}"
+    return console.named(path, str(answer) if isinstance(answer, FrameError) else answer.message)

@@ -19,16 +19,8 @@ from starpos.units import DAY_S, utc_text
 MAX_LATITUDE_DEG = 45.0
 DRAWN = ("-n", "4", "--size", "2808", "1872")
 # of the drawn instrument
-KNOWN = [
-    "--misalignment",
-    "0",
-    "0",
-    "0",
-    "--misalignment-stddev",
-    "5",
-    "--inclinometer",
-    "sca100t_calibrated",
-]
+A3 = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
+KNOWN = (*A3, "--inclinometer", "sca100t_calibrated")
 
 
 def run(args: argparse.Namespace) -> int:

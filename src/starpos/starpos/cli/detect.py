@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 def run(args: argparse.Namespace) -> int:
     output = console.Output(args, "stars")
     args.frames = inputs.frames_among(args.frames)
-    status, answers = 0, inputs.worked(args, partial(Reader().on, detected), args.frames)
-    for path, answer in zip(args.frames, answers, strict=True):
+    status = 0
+    for path, answer in inputs.worked(args, partial(Reader().on, detected), args.frames):
         if isinstance(answer, FrameError):
             status = console.UNREADABLE
         _tell(path, answer, output)
@@ -34,8 +34,7 @@ def _tell(path: str, answer: "tuple[Detection | Stars, float] | FrameError", out
         )
         return
     found, cpu_ms = answer
-    stars = found if isinstance(found, Stars) else found.stars
-    left_out = 0 if isinstance(found, Stars) else found.left_out
+    stars, left_out = (found, 0) if isinstance(found, Stars) else (found.stars, found.left_out)
     rows = _rows(stars)
     value = {"file": path, "stars": rows, "cpu_ms": cpu_ms, "negative": stars.negative}
     value |= {"left_out": left_out} if left_out else {}

@@ -5,7 +5,6 @@ A package that may be missing is imported only inside its check.
 """
 
 import argparse
-import json
 import os
 import platform
 import tempfile
@@ -13,6 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from enum import Enum
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -51,16 +51,18 @@ class Finding:
     cure: str = ""
 
 
+ok, note, missing = (partial(Finding, state) for state in State)
+
+
 def run(args: argparse.Namespace) -> int:
-    missing = False
+    any_missing = False
     for name, check in CHECKS.items():
         finding = _safely(check)
         if args.live and name in LIVE and finding.state is State.NOTE:
             finding = replace(finding, state=State.MISSING)
-        missing |= finding.state is State.MISSING
-        said = json.dumps({"check": name} | asdict(finding)) if args.json else _lines(name, finding)
-        print(said, flush=True)
-    return console.NOTHING if missing else 0
+        any_missing |= finding.state is State.MISSING
+        console.tell(args, {"check": name} | asdict(finding), _lines(name, finding))
+    return console.NOTHING if any_missing else 0
 
 
 def _lines(name: str, finding: Finding) -> str:
@@ -73,20 +75,15 @@ def _safely(check: Callable[[], Finding]) -> Finding:
     try:
         return check()
     except ImportError as error:
-        return Finding(
-            State.MISSING, f"cannot be determined: {one_line(error)}", "see the packages that are missing"
-        )
+        return missing(f"cannot be determined: {one_line(error)}", "see the packages that are missing")
     except (StarposError, OSError) as error:
-        return Finding(State.MISSING, one_line(error))
+        return missing(one_line(error))
 
 
 def versions() -> Finding:
     """The versions of starpos, Python and the system."""
     system = f"{platform.system()} {platform.machine()}"
-    return Finding(
-        State.OK,
-        f"{__version__} in {Path(__file__).parents[1]}, Python {platform.python_version()}, {system}",
-    )
+    return ok(f"{__version__} in {Path(__file__).parents[1]}, Python {platform.python_version()}, {system}")
 
 
 def packages() -> Finding:
@@ -95,8 +92,8 @@ def packages() -> Finding:
         package for module, package in rows_of(PACKAGES)["needed"].items() if find_spec(module) is None
     ]
     if lacking:
-        return Finding(State.MISSING, f"not here: {', '.join(lacking)}", f"pip install {' '.join(lacking)}")
-    return Finding(State.OK, ", ".join(f"{p} {_version(p)}" for p in rows_of(PACKAGES)["needed"].values()))
+        return missing(f"not here: {', '.join(lacking)}", f"pip install {' '.join(lacking)}")
+    return ok(", ".join(f"{p} {_version(p)}" for p in rows_of(PACKAGES)["needed"].values()))
 
 
 def _version(package: str) -> str:
@@ -111,12 +108,11 @@ def _version(package: str) -> str:
 def compiled() -> Finding:
     """The compiled modules."""
     if find_spec("starpos._numeric.roots") is None:
-        return Finding(
-            State.MISSING,
+        return missing(
             "the modules in Cython are not compiled",
             "pip install ./src/starpos, or make build in a clone (a C compiler is needed)",
         )
-    return Finding(State.OK, "the modules in Cython are compiled")
+    return ok("the modules in Cython are compiled")
 
 
 def optional() -> Finding:
@@ -127,9 +123,9 @@ def optional() -> Finding:
         if find_spec(module) is None
     }
     if not lacking:
-        return Finding(State.OK, "all optional packages are here")
+        return ok("all optional packages are here")
     uses = "; ".join(f"{package} ({use})" for package, use in lacking.items())
-    return Finding(State.NOTE, f"not here: {uses}", f"pip install {' '.join(lacking)}")
+    return note(f"not here: {uses}", f"pip install {' '.join(lacking)}")
 
 
 def star_catalogue() -> Finding:
@@ -141,7 +137,7 @@ def star_catalogue() -> Finding:
     found = f"{len(stars)} stars to V = {stars.vmag().max():.1f}, {where}"
     if deeper.kept() is None:
         found += "; no deeper one, which fields under about 1 deg need (docs/how-to/small_fields.md)"
-    return Finding(State.OK, found)
+    return ok(found)
 
 
 def cache() -> Finding:
@@ -154,8 +150,7 @@ def cache() -> Finding:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        return Finding(
-            State.MISSING,
+        return missing(
             f"{folder}: cannot be written ({error.strerror}): each start sorts the sky again",
             "export XDG_CACHE_HOME=FOLDER",
         )
@@ -165,7 +160,7 @@ def cache() -> Finding:
         if megabytes >= 1
         else "empty: the first frame of a camera takes some seconds"
     )
-    return Finding(State.OK, f"{folder}, {kept}")
+    return ok(f"{folder}, {kept}")
 
 
 def earth_rotation() -> Finding:
@@ -178,10 +173,9 @@ def earth_rotation() -> Finding:
     beyond = orientation.earth_orientation(now).extrapolated_days
     found = f"IERS table, measured until {utc_text(until)[:10]}, {(now - until) / DAY_S:.0f} days ago"
     if beyond <= 0:
-        return Finding(State.OK, found)
+        return ok(found)
     sigma_m = orientation.earth_orientation(now).ut1_sigma_s * orientation.EQUATOR_M_PER_S
-    return Finding(
-        State.NOTE,
+    return note(
         f"{found}: its predictions ended {beyond:.0f} days ago, an error of {sigma_m:.0f} m east at the equator",
         "pip install --upgrade astropy-iers-data",
     )
@@ -193,11 +187,10 @@ def clock() -> Finding:
 
     state = system_clock.read()
     if state is None:
-        return Finding(State.NOTE, "the system does not report whether it is kept to UTC")
+        return note("the system does not report whether it is kept to UTC")
     if state.synchronised:
-        return Finding(State.OK, f"kept to UTC within {state.max_error_s:.2g} s; 1 s is 464 m at the equator")
-    return Finding(
-        State.NOTE,
+        return ok(f"kept to UTC within {state.max_error_s:.2g} s; 1 s is 464 m at the equator")
+    return note(
         "nothing keeps it to UTC: frames stamped on this machine give no longitude; recorded ones are not "
         "affected",
         "sudo apt-get install chrony   # or: sudo timedatectl set-ntp true",
@@ -208,7 +201,7 @@ def serial_ports(root: Path = Path("/")) -> Finding:
     """Serial ports, for an inclinometer."""
     found = {os.path.realpath(path): path for pattern in reversed(SERIAL) for path in root.glob(pattern)}
     if not found:
-        return Finding(State.NOTE, "none: no inclinometer is plugged in")
+        return note("none: no inclinometer is plugged in")
     return _devices([str(path) for path in found.values()], "dialout")
 
 
@@ -221,14 +214,11 @@ def cameras(root: Path = Path("/")) -> Finding:
         if _text(interface) == STILL_IMAGE
     )
     if not videos and not photo:
-        return Finding(
-            State.NOTE,
-            "no video device and no photo camera on USB; a camera on the network is not looked for",
-        )
+        return note("no video device and no photo camera on USB; a camera on the network is not looked for")
     names = [f"{v} ({_text(root / 'sys/class/video4linux' / v.name / 'name') or 'no name'})" for v in videos]
     finding = _devices([str(v) for v in videos], "video", [*names, *(f"{p} (photo, USB)" for p in photo)])
     if photo and find_spec("gphoto2") is None and finding.state is State.OK:
-        return Finding(State.NOTE, f"{finding.found}; photo cameras need gphoto2", "pip install gphoto2")
+        return note(f"{finding.found}; photo cameras need gphoto2", "pip install gphoto2")
     return finding
 
 
@@ -237,9 +227,8 @@ def _devices(paths: list[str], group: str, names: list[str] | None = None) -> Fi
     barred = [path for path in paths if not os.access(path, os.R_OK | os.W_OK)]
     found = ", ".join(names or paths)
     if not barred:
-        return Finding(State.OK, found)
-    return Finding(
-        State.NOTE,
+        return ok(found)
+    return note(
         f"{found}; this user may not open {', '.join(barred)}",
         f"sudo usermod -aG {group} $USER   # and log in again",
     )
@@ -257,12 +246,11 @@ def ros() -> Finding:
     """ROS 2 and the packages of the nodes."""
     distribution = os.environ.get("ROS_DISTRO", "")
     if find_spec("rclpy") is None:
-        return Finding(State.NOTE, "not in this shell; the command line does not need it")
+        return note("not in this shell; the command line does not need it")
     nodes = [name for name in ("starpos_camera", "starpos_inclinometer", "starpos_solver") if find_spec(name)]
     if len(nodes) == 3:
-        return Finding(State.OK, f"{distribution or 'rclpy'}, and the nodes of starpos")
-    return Finding(
-        State.NOTE,
+        return ok(f"{distribution or 'rclpy'}, and the nodes of starpos")
+    return note(
         f"{distribution or 'rclpy'}, but the nodes of starpos are not in this shell",
         ". install/setup.bash   # in the workspace that was built",
     )

@@ -17,7 +17,7 @@ from starpos.instrument import instrument_file
 from starpos.instrument.tilt_log import BRACKET_S, TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.night import field
-from starpos.night.first_night import AROUND_S, FirstNight, Look, Stage
+from starpos.night.first_night import AROUND_S, LEVEL, FirstNight, Look
 from starpos.night.opening import exposures, frames_in
 from starpos.night.reading import Instruments, stars_of
 from starpos.night.work import Solving
@@ -39,18 +39,18 @@ def run(args: argparse.Namespace) -> int:
         raise FrameError(
             f"{folder}: there is no such folder: make it, and have frames and {TILTS} arrive there"
         )
-    if args.field is not None and not args.field.lower().endswith(field.SUFFIX):
-        raise FrameError(f"--field {args.field}: give it a name that ends in {field.SUFFIX}")
+    if args.field is not None:
+        field.check_name(args.field)
     try:
         night, given = _watched(args, folder)
     except KeyboardInterrupt:
         console.complain(f"stopped: {AGAIN}")
         return console.NOTHING
     found = None if night is None else night.turned
-    if found is None or found.calibrated is None:
+    if found is None:
         console.complain(f"no frame has come for {args.patience:g} s, and A3 is not known yet: {AGAIN}")
         return console.NOTHING
-    overwriting.save_instrument(args.save, found.calibrated.instrument, "A3 by the first night")
+    overwriting.save_instrument(args.save, found.instrument, "A3 by the first night")
     print(f"done: {args.save} is written -> starpos solve FRAMES --tilt {TILTS} --instrument {args.save}")
     if args.field is not None:
         packed = exposures(folder, given, options.atmosphere_of(args), Deflection(), read=reader_of(args))
@@ -85,10 +85,9 @@ def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None,
                 night = FirstNight(Solver(options.instrument_of(args, item), catalogue.load_catalogue(), air))
             sight = Solving(given)(item)
             step = night.step
-            assert step is not None
             look = night.inspect(sight, _tilts(folder, night, stars_of(item)))
             _tell(step, look, sight.stars)
-            if night.step is None:
+            if not night.step:
                 return night, given
         if time.monotonic() - waited > args.patience:
             return night, given
@@ -118,15 +117,17 @@ def _tilts(folder: Path, night: FirstNight, stars: Stars) -> TiltLog | str:
         time.sleep(POLL_S)
 
 
-def _tell(step: Stage, look: Look, stars: Stars) -> None:
+def _tell(step: str, look: Look, stars: Stars) -> None:
     """Print what a step found, and after the level the clock."""
     at = utc_text(stars.mid_unix_s)[11:19] if stars.mid_unix_s else "--:--:--"
-    mark = "ok" if look.done else ".."
-    print(f"{at} {mark} {step.value:<9}{look.found}\n{'':12}-> {look.todo}", flush=True)
+
+    def line(mark: str, what: str, found: str, todo: str) -> None:
+        advice = f"\n{'':12}-> {todo}" if todo else ""
+        print(f"{at} {mark} {what:<9}{found}{advice}", flush=True)
+
+    line("ok" if look.done else "..", step, look.found, look.todo)
     if look.done and sys.stdout.isatty():
         print("\a", end="", flush=True)
-    if look.done and step is Stage.LEVEL:
-        finding = doctor.clock()
-        mark = "ok" if finding.state is doctor.State.OK else "!!"
-        cure = f"\n{'':12}-> {finding.cure}" if finding.cure else ""
-        print(f"{at} {mark} {'clock':<9}{finding.found}{cure}", flush=True)
+    if look.done and step == LEVEL:
+        clock = doctor.clock()
+        line("ok" if clock.state is doctor.State.OK else "!!", "clock", clock.found, clock.cure)

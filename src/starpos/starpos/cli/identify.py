@@ -22,8 +22,7 @@ def run(args: argparse.Namespace) -> int:
     complaints = console.FrameComplaints()
     read, output = inputs.reader_of(args), console.Output(args, "field")
     solving = inputs.identifying(args, args.frames, read, args.search_time)
-    answers = inputs.worked(args, partial(read.on, solving), args.frames)
-    for path, answer in zip(args.frames, answers, strict=True):
+    for path, answer in inputs.worked(args, partial(read.on, solving), args.frames):
         if isinstance(answer, FrameError):
             unreadable, found, cpu_ms = True, Solution.unreadable(path, answer), 0.0
         else:

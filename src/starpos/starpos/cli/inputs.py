@@ -10,12 +10,14 @@ from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from starpos.cli import console, options
 from starpos.earth.place import Place
+from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.blind import BlindSolver
+from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.searching import Sight
 from starpos.fix.solver import Solver
 from starpos.frames.exif import CameraClock
@@ -23,8 +25,8 @@ from starpos.frames.frame import Frame, Stars, no_stars
 from starpos.frames.reading import are_photographs, read_frame, why_no_time
 from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB, Camera
-from starpos.instrument.instrument import Instrument
-from starpos.night.opening import work_of
+from starpos.instrument.instrument import ByGravity, Instrument
+from starpos.night.opening import frames_in, work_of
 from starpos.night.reading import Instruments, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
 from starpos.night.work import Solving
@@ -32,7 +34,11 @@ from starpos.parallel.processes import DoCalls, memory_bytes, processors, worker
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:
-    from starpos.night.bag import Recorded
+    from starpos.night.solving import Exposures
+
+
+# the word of --exif-utc-offset that lets each file say it
+FILES_OWN = "file"
 
 
 def reader_of(args: argparse.Namespace, by_files: bool = False) -> Reader:
@@ -40,7 +46,9 @@ def reader_of(args: argparse.Namespace, by_files: bool = False) -> Reader:
 
     by_files: without a clock by the options, each file's own counts, as its EXIF states it.
     """
-    clock = options.clock_of(args) or (CameraClock() if by_files else None)
+    offset_h, clock = args.exif_utc_offset, CameraClock() if by_files else None
+    if offset_h is not None:
+        clock = CameraClock(None if offset_h == FILES_OWN else offset_h, args.exif_clock_stddev)
     return Reader(clock, tuple(args.shutter_delay or (0.0, 0.0)))
 
 
@@ -67,17 +75,23 @@ def is_untold(args: argparse.Namespace) -> bool:
     return (args.instrument, args.focal_mm, args.pixel_um) == (None,) * 3 and args.lens == PLUMB_BOB
 
 
-def seen_at(args: argparse.Namespace, place: Place) -> Iterator[tuple[Frame | Stars, Sight, Camera]]:
-    """Frames with their attitudes at a place, and the camera with the focal length that their stars show.
+@dataclass(frozen=True)
+class FrameAtPlace:
+    """A frame whose attitude at a known place is known, and its camera with the focal length that its stars show."""
+
+    item: Frame | Stars
+    sight: Sight
+    at_place: AttitudeAtPlace
+    camera: Camera
+
+
+def seen_at(args: argparse.Namespace, place: Place) -> Iterator[FrameAtPlace]:
+    """Frames with their attitudes at a place.
 
     Frames without an attitude are complained about.  Raises StarposError as `solve` does.
     """
     read = reader_of(args)
-    about = read.first(args.frames)
-    if about is None:
-        # says why
-        read(args.frames[0])
-    assert about is not None
+    about = read.one_of(args.frames)
     work, remarks = work_of(given_or_sought(args, about), about, None, options.atmosphere_of(args), place)
     console.complain(*remarks)
     if work.instruments.sought:
@@ -89,28 +103,28 @@ def seen_at(args: argparse.Namespace, place: Place) -> Iterator[tuple[Frame | St
             console.complain(e)
             continue
         sight = work(item)
-        answer = sight.solution
-        if answer.at_place is None or answer.found is None:
+        answer, at_place = sight.solution, sight.solution.at_place
+        if at_place is None or answer.found is None:
             timed = answer.found is None or item.mid_unix_s
             no_time = f"{item.place}: no time of exposure: {why_no_time(item)}"
-            why = answer.message if item.place in answer.message else f"{item.place}: {answer.message}"
-            console.complain(why if timed else no_time)
+            console.complain(console.named(item.place, answer.message) if timed else no_time)
             continue
         instrument = sight.instrument or work.instruments.of(item)
         assert instrument is not None
         camera = instrument.camera_for(item.width, item.height, item.origin_px)
-        yield item, sight, camera.scaled(answer.found.focal_scale * answer.at_place.focal_scale)
+        yield FrameAtPlace(
+            item, sight, at_place, camera.scaled(answer.found.focal_scale * at_place.focal_scale)
+        )
 
 
 def identifying(args: argparse.Namespace, frames: Sequence[str], read: Reader, search_s: float) -> Solving:
     """The work that identifies frames with the camera of the options, else of their headers, else of any scale."""
     about = read.first(frames)
     given = Instruments(None, by_header=True)
-    if about is not None and is_untold(args) and about.focal_px is None:
-        BlindSolver(catalogue.load_catalogue(), console.ProgressBar()).prepare()
-    elif about is not None:
-        given = given_of(args, about)
-        prepare(options.instrument_of(args, about), about)
+    if about is not None:
+        if about.focal_px is not None or not is_untold(args):
+            given = given_of(args, about)
+        prepare(given, about)
     # without a frame that can be read, each one reports why it cannot
     return Solving(given, search_s=search_s, progress=console.ProgressBar())
 
@@ -139,12 +153,12 @@ def near_of(args: argparse.Namespace) -> Near | None:
 class NightFolder:
     """Frames with one table of tilts that make one fix together.
 
-    tilt: absolute path; None where none is needed, or photographs have their own.
+    tilt: absolute path, or that photographs have their own; None where none is needed.
     folder: None if the frames were named one by one.
     """
 
     frames: tuple[str, ...]
-    tilt: str | None
+    tilt: Path | ByGravity | None
     folder: str | None = None
 
 
@@ -171,13 +185,13 @@ def nights_of(
     Raises FrameError for a path that does not exist, TiltError for frames without a table.
     """
     if tilt is not None:
-        return [NightFolder(tuple(given), os.path.abspath(tilt))]
+        return [NightFolder(tuple(given), Path(os.path.abspath(tilt)))]
     if needs_no_tilt:
         return [NightFolder(tuple(given), None)]
     if missing := next((path for path in given if not os.path.exists(path)), None):
         raise FrameError(f"{missing}: there is no such file or folder")
     if are_photographs(given):
-        return [NightFolder(tuple(given), None)]
+        return [NightFolder(tuple(given), ByGravity())]
     if single := next((path for path in given if not os.path.isdir(path)), None):
         raise TiltError(
             f"{single}: no tilts: give --tilt with frames, or nights alone: folders of frames, each with its tilt.csv; "
@@ -195,21 +209,20 @@ def stated_site(frames: Sequence[str]) -> str:
 
 
 def _night(folder: str) -> NightFolder | FrameError:
-    from starpos.night.opening import frames_in
-
     try:
         frames = tuple(map(str, frames_in(Path(folder))))
     except FrameError as error:
         return error
-    tilt = os.path.abspath(os.path.join(folder, TILTS))
-    return NightFolder(frames, None if are_photographs(frames) and not os.path.exists(tilt) else tilt, folder)
+    tilt = Path(os.path.abspath(os.path.join(folder, TILTS)))
+    by_gravity = are_photographs(frames) and not tilt.exists()
+    return NightFolder(frames, ByGravity() if by_gravity else tilt, folder)
 
 
 PIP = "pip install matplotlib rosbags"
 
 
-def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instruments]":
-    """One instrument's part of a bag, and the instrument of its frames; raises StarposError."""
+def bag_of(path: Path, args: argparse.Namespace, vertical: Vertical) -> "Exposures":
+    """One instrument's part of a bag, to be solved; raises StarposError."""
     if find_spec("rosbags") is None:
         raise FrameError(f"{path}: bags are read with rosbags, which is not here: {PIP}")
     from starpos.night import bag
@@ -217,11 +230,17 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
     from starpos.recording.topics import remaps_of
 
     any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
-    drivers = Drivers.of(args.params_file, args.param, args.namespace, remaps_of(args.remap))
-    found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, drivers, console.ProgressBar())
     told = (args.instrument, args.focal_mm) != (None, None)
-    cameras = found.cameras if args.focal_mm is None else {}
-    return found, Instruments(any_camera, cameras=cameras, any_size=told)
+    return bag.exposures(
+        path,
+        args.namespace,
+        Drivers.of(args.params_file, args.param, args.namespace, remaps_of(args.remap)),
+        Instruments(any_camera, any_size=told),
+        options.atmosphere_of(args),
+        vertical,
+        console.ProgressBar(),
+        own_cameras=args.focal_mm is None,
+    )
 
 
 # Frames of a picture's size that are worth the start of a process, which takes a second of CPU time; and its memory.
@@ -243,10 +262,11 @@ def worked(
     paths: Sequence[str],
     what: str = "frame",
     lines: bool = True,
-) -> Iterator:
-    """What a work makes of each file, in their order, by the workers of --jobs, as `watched`."""
+) -> Iterator[tuple[str, Any]]:
+    """Each file with what a work makes of it, in their order, by the workers of --jobs, as `watched`."""
     with workers_of(args, paths) as do_calls:
-        yield from watched(do_calls((work, path) for path in paths), len(paths), what, lines)
+        answers = watched(do_calls((work, path) for path in paths), len(paths), what, lines)
+        yield from zip(paths, answers, strict=True)
 
 
 def watched(answers: Iterable, number: int, what: str = "frame", lines: bool = True) -> Iterator:
@@ -258,9 +278,13 @@ def watched(answers: Iterable, number: int, what: str = "frame", lines: bool = T
         yield answer
 
 
-def prepare(instrument: Instrument, about: Stars) -> None:
-    """Put the tables of a field into the cache, for all processes of a machine; reports what the catalogue lacks."""
-    solver = Solver(instrument, catalogue.load_catalogue(), progress=console.ProgressBar())
+def prepare(given: Instruments, about: Stars) -> None:
+    """Put the tables of a field, or of any, into the cache, for all processes; reports what the catalogue lacks."""
+    stars, bar = catalogue.load_catalogue(), console.ProgressBar()
+    if given.instrument is None or given.sought:
+        BlindSolver(stars, bar).prepare()
+        return
+    solver = Solver(given.instrument, stars, progress=bar)
     # the frames report the error
     with suppress(StarposError):
         if thin := solver.prepare(about.width, about.height, about.origin_px):

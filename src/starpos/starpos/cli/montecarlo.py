@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
             tally.ask(given, given.stars(conditions), looking(solver), conditions.tolerance_rad)
             bar(label, done / number)
         wrong += tally.wrong
-        _print_row(label, paper, tally, args.json)
+        _tell_row(args, label, paper, tally)
     return int(wrong > 0)
 
 
@@ -95,21 +95,15 @@ def _print_head(conditions: montecarlo_fields.Conditions, stars: Catalogue) -> N
     )
 
 
-def _print_row(label: str, paper: str, t: montecarlo_fields.Tally, as_json: bool) -> None:
+def _tell_row(args: argparse.Namespace, label: str, paper: str, t: montecarlo_fields.Tally) -> None:
     low, high = t.interval
     median, worst = (float(f(t.cpu_ms)) if t.cpu_ms else float("nan") for f in (np.median, np.max))
-    if as_json:
-        console.print_json(
-            {
-                "row": label, "fields": t.fields, "correct": t.correct, "wrong": t.wrong, "none": t.none,
-                "correct_low": low, "correct_high": high, "cpu_ms_median": median, "cpu_ms_worst": worst,
-                "paper_percent": paper or None,
-            }
-        )  # fmt: skip
-        return
+    values = {
+        "row": label, "fields": t.fields, "correct": t.correct, "wrong": t.wrong, "none": t.none,
+        "correct_low": low, "correct_high": high, "cpu_ms_median": median, "cpu_ms_worst": worst,
+        "paper_percent": paper or None,
+    }  # fmt: skip
     share = 100 * t.correct / t.fields if t.fields else float("nan")
     right = f"{share:11.2f}   ({100 * low:.2f} .. {100 * high:.2f})" if label != "random points" else ""
-    print(
-        f"{label:15}{t.fields:8d}{right:30}{t.wrong:6d}{t.none:6d}{median:9.2f}{worst:8.1f}   {paper:>9}",
-        flush=True,
-    )
+    line = f"{label:15}{t.fields:8d}{right:30}{t.wrong:6d}{t.none:6d}{median:9.2f}{worst:8.1f}   {paper:>9}"
+    console.tell(args, values, line)

@@ -26,18 +26,10 @@ def run(args: argparse.Namespace) -> int:
     axes = options.axes_of(args)
     readings = None if args.readings is None else _readings(args.readings)
     place = options.camera_place_of(args)
-    seen = [
-        (sight.stars.source, at)
-        for _, sight, _ in inputs.seen_at(args, place)
-        if (at := sight.solution.at_place) is not None
-    ]
-    try:
-        if readings is None:
-            return _axis(args, place, [a for _, a in seen])
-        return _circle(args, seen, readings, axes[list(axes)[-1]])
-    except FixError as e:
-        console.complain(e)
-        return console.NOTHING
+    seen = [(s.sight.stars.source, s.at_place) for s in inputs.seen_at(args, place)]
+    if readings is None:
+        return _axis(args, place, [a for _, a in seen])
+    return _circle(args, seen, readings, axes[list(axes)[-1]])
 
 
 def _axis(args: argparse.Namespace, place: Place, seen: Sequence[AttitudeAtPlace]) -> int:
@@ -80,7 +72,7 @@ def _circle(
 ) -> int:
     """Print the orientation of a horizontal circle."""
     there = [(path, a, readings[Path(path).name]) for path, a in seen if Path(path).name in readings]
-    for path in {Path(p).name for p, _ in seen} - set(readings):
+    for path in sorted({Path(p).name for p, _ in seen} - set(readings)):
         console.complain(f"{path}: {args.readings} has no reading of it: it is left out")
     if not there:
         raise FixError(

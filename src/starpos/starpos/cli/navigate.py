@@ -13,7 +13,7 @@ from starpos.cli import console, inputs, options
 from starpos.cli.fix_output import FIX_KEYS
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Geodetic, Vertical
-from starpos.errors import FixError, VoyageError
+from starpos.errors import VoyageError
 from starpos.instrument.instrument import framed
 from starpos.navigation.estimate import VoyageFix
 from starpos.navigation.voyage import Voyage
@@ -50,17 +50,12 @@ def run(args: argparse.Namespace) -> int:
         drift_stddev=args.drift_stddev,
     )
     console.complain(doubt)
-    inputs.prepare(instrument, about)
     given = replace(inputs.given_of(args, about), instrument=instrument)
+    inputs.prepare(given, about)
     work = partial(read.on, partial(under_way.voyage_frame, given))
-    frames = under_way.voyage_frames(inputs.worked(args, work, args.frames))
-    for frame in frames:
-        console.complain(frame.message)
-    try:
-        voyage = under_way.voyage_of(frames, args.imu, args.velocity, vessel, console.ProgressBar())
-    except FixError as error:
-        console.complain(error)
-        return console.NOTHING
+    frames = under_way.voyage_frames(answer for _, answer in inputs.worked(args, work, args.frames))
+    console.complain(*(frame.message for frame in frames))
+    voyage = under_way.voyage_of(frames, args.imu, args.velocity, vessel, console.ProgressBar())
     return tell(args, frames, voyage, vertical)
 
 

@@ -13,7 +13,6 @@ from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
 from starpos.errors import InstrumentError
 from starpos.fix.directions import OPTICAL_AXIS
-from starpos.frames.exif import CameraClock
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument import instrument, instrument_file, platepar, sensors
@@ -31,8 +30,7 @@ def has_own_level(args: argparse.Namespace) -> bool:
     """Whether --instrument is the file of a camera fixed to the ground; InstrumentError if there is a --tilt too."""
     if args.instrument is None:
         return False
-    pointed = getattr(args, "pointings", None) is not None
-    if instrument_file.read(args.instrument, needs_camera=not pointed).vertical is None:
+    if _instrument_in_file(args).vertical is None:
         return False
     if args.tilt is not None or getattr(args, "self_calibrate", False):
         raise InstrumentError(
@@ -52,17 +50,6 @@ def fill_site(args: argparse.Namespace) -> None:
         return
     station = platepar.read(args.instrument)
     args.site, args.geodetic = [station.latitude_deg, station.longitude_deg], True
-
-
-FILES_OWN = "file"
-
-
-def clock_of(args: argparse.Namespace) -> CameraClock | None:
-    """The clock that wrote the times in EXIF; None if the options do not give it.  Raises InstrumentError."""
-    offset_h, stddev_s = args.exif_utc_offset, args.exif_clock_stddev
-    if offset_h is None:
-        return None
-    return CameraClock(None if offset_h == FILES_OWN else offset_h, stddev_s)
 
 
 def turn_of(args: argparse.Namespace) -> float:
@@ -94,19 +81,17 @@ def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> inst
 
     Raises InstrumentError if the options do not fit together or there is no focal length.
     """
-    path = getattr(args, "instrument", None)
     misalignment = getattr(args, "misalignment", None)
     stddev = getattr(args, "misalignment_stddev", None)
     model = getattr(args, "inclinometer", None)
     lens = getattr(args, "lens", PLUMB_BOB)
     flat = (args.focal_mm, args.pixel_um, misalignment, stddev, model) != (None,) * 5 or lens != PLUMB_BOB
-    if path is not None:
+    if getattr(args, "instrument", None) is not None:
         if flat:
             raise InstrumentError(
                 "--instrument holds focal length, lens, misalignment and the inclinometer: give either it or the options"
             )
-        pointed = getattr(args, "pointings", None) is not None
-        return _with_times(instrument_file.read(path, needs_camera=not pointed), args)
+        return _with_times(_instrument_in_file(args), args)
     if (args.focal_mm is None) != (args.pixel_um is None):
         raise InstrumentError("--focal-mm and --pixel-um belong together: give both")
     if args.focal_mm is not None:
@@ -127,6 +112,11 @@ def instrument_of(args: argparse.Namespace, first: Frame | Stars | None) -> inst
         inclinometer_model=model,
     )
     return _with_times(made, args)
+
+
+def _instrument_in_file(args: argparse.Namespace) -> instrument.Instrument:
+    """The instrument of --instrument; pointings need no camera."""
+    return instrument_file.read(args.instrument, needs_camera=getattr(args, "pointings", None) is None)
 
 
 def _with_times(known: instrument.Instrument, args: argparse.Namespace) -> instrument.Instrument:

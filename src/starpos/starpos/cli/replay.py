@@ -22,11 +22,8 @@ def run(args: argparse.Namespace) -> int:
     # a wrong parameter is reported once, not for each bag
     Drivers.of(args.params_file, args.param, args.namespace)
     work = Playing(args.params_file, tuple(args.param), args.namespace, remaps_of(args.remap))
-    answers = inputs.worked(args, work, args.bags, "bag")
-    return max(
-        tell(args, output, bag, night, settings.vertical)
-        for bag, night in zip(args.bags, answers, strict=True)
-    )
+    nights = inputs.worked(args, work, args.bags, "bag")
+    return max(tell(args, output, bag, night, settings.vertical) for bag, night in nights)
 
 
 def tell(
@@ -40,8 +37,7 @@ def tell(
     if isinstance(night, FrameError):
         console.complain(night)
         return console.UNREADABLE
-    for sentence in night.said:
-        console.complain(f"{bag}: {sentence}")
+    console.complain_of(bag, *night.said)
     gathered = Gathered()
     for solution in night.solutions:
         gathered.gather(FrameAnswer(bag, solution))
@@ -59,8 +55,7 @@ def tell(
     if whole:
         calibration = night.instrument.calibration
         remarks.append(unknown_a3(calibration, whole.covariance, whole.terms, BY_PARAMETERS))
-    for remark in filter(None, remarks):
-        console.complain(f"{bag}: {remark}")
+    console.complain_of(bag, *remarks)
     if solved:
         fix_output.put_combined(output, bag if len(args.bags) > 1 else None, whole, gathered, vertical)
     if (by_satellites := night.by_satellites) is not None:

@@ -56,7 +56,8 @@ def run(args: argparse.Namespace) -> int:
         bar("figures", (k + 1) / len(nights))
     known = [(k, n) for k, n in enumerate(nights, 1) if n.truth and n.combined]
     overall = [nights_picture(known)] if len(nights) > 1 and known else []
-    html = page(nights, each, overall, _now_text())
+    now = utc_text(time.time())[:16].replace("T", " ")
+    html = page(nights, each, overall, f"{now} UTC")
     files = {f"{p.name}.png": p.png for p in overall}
     for k, pictures in enumerate(each, 1):
         prefix = f"night{k}-" if len(nights) > 1 else ""
@@ -78,11 +79,13 @@ def _groups(names: list[str]) -> list[list[Path]]:
 
 
 def _nights(groups: list[list[Path]], args: argparse.Namespace) -> list[Night]:
-    """The nights, after complaints about what is wrong with them."""
-    nights = [_night(paths, args) for paths in groups]
+    """The nights, after complaints about what is wrong with them; raises StarposError for one without frames."""
+    nights = []
+    for paths in groups:
+        how = how_of(args)
+        nights.append(solved_night(_exposures(paths, args), how, console.ProgressBar()))
     for night in nights:
-        for sentence in (*night.remarks, *([night.why_not] if night.why_not else [])):
-            console.complain(f"{night.name}: {sentence}")
+        console.complain_of(night.name, *night.remarks, night.why_not)
     return nights
 
 
@@ -98,40 +101,29 @@ def _write_places(args: argparse.Namespace) -> int:
     return 0 if answers[-1]["utc"] else console.NOTHING
 
 
-def _now_text() -> str:
-    return utc_text(time.time())[:16].replace("T", " ") + " UTC"
-
-
 def _pack(args: argparse.Namespace) -> int:
     """Write a field report of one night."""
     from starpos.night import field
 
     if len(args.nights) > 1:
         raise FrameError("--field packs one night: give one")
-    if not args.field.lower().endswith(field.SUFFIX):
-        raise FrameError(f"--field {args.field}: give it a name that ends in {field.SUFFIX}")
+    field.check_name(args.field)
     count = field.write(Path(args.field), _exposures([Path(args.nights[0])], args), console.ProgressBar())
     print(f"{args.field}: {count} frames")
     return 0
-
-
-def _night(paths: list[Path], args: argparse.Namespace) -> Night:
-    """The Night of a folder, a bag or photographs; raises StarposError if there is nothing to work on."""
-    how = how_of(args)
-    return solved_night(_exposures(paths, args), how, console.ProgressBar())
 
 
 def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
     """The exposures of a folder, of photographs or of a bag; raises StarposError without any."""
     from starpos.night import bag
 
-    air, vertical, path = options.atmosphere_of(args), options.vertical_of(args), paths[0]
+    vertical, path = options.vertical_of(args), paths[0]
     if not path.exists():
         raise FrameError(f"{path}: there is no such night: give a folder, a rosbag2, or photographs")
     if bag.is_bag(path):
         if args.gnss is not None:
             raise FrameError(f"{path}: --gnss goes with a folder of frames, and this is a bag: leave it out")
-        return bag.exposures(*inputs.read_bag(path, args), air, vertical)
+        return inputs.bag_of(path, args, vertical)
     frames = paths if path.is_file() else []
     if frames and not are_photographs(frames):
         raise FrameError(
@@ -142,4 +134,5 @@ def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
     # a field report states the focal length
     find = inputs.given_or_sought if args.field is None else inputs.given_of
     given = Instruments(None) if about is None else find(args, about)
+    air = options.atmosphere_of(args)
     return exposures(folder, given, air, vertical, read=read, frames=frames)

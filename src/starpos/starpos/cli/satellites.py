@@ -101,7 +101,7 @@ def _look(args: argparse.Namespace, frames: list[str], trails: list[SatelliteTra
     number, sights = 1 + max((trail.track for trail in trails), default=-1), {}
     complaints, read = console.FrameComplaints(), inputs.reader_of(args)
     work = partial(read.on, partial(trails_seen, inputs.identifying(args, frames, read, SEARCH_S)))
-    for path, answer in zip(frames, inputs.worked(args, work, frames), strict=True):
+    for path, answer in inputs.worked(args, work, frames):
         if isinstance(answer, FrameError):
             complaints(path, str(answer))
         elif isinstance(answer, Solution):

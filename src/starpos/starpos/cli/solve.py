@@ -12,27 +12,36 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starpos.averaging.elevation_axis import FoundAxis
-from starpos.cli import console, fix_output, inputs, options, overwriting, places_file, sights
+from starpos.averaging.sights import circle_of_sight, place_of_sights, read_sights
+from starpos.calibration.misalignment import Calibrated
+from starpos.cli import console, fix_output, inputs, options, overwriting, places_file
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import InstrumentError, StarposError, TiltError
-from starpos.fix.blind import BlindSolver
 from starpos.fix.checks import unnamed_inclinometer
+from starpos.fix.circle import Circle
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.frames.reading import are_photographs
 from starpos.frames.tables import Pointing, read_pointings
 from starpos.instrument import instrument_file
-from starpos.instrument.instrument import ByGravity, Instrument
+from starpos.instrument.instrument import UNKNOWN_CLOCK_S, ByGravity, Instrument
 from starpos.instrument.phone_log import is_phone_log
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night import field
 from starpos.night.opening import work_of
 from starpos.night.reading import NO_CAMERA, Instruments
-from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near
+from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, worth_saving
 from starpos.night.solving import How, NightAnswers, answers_of
-from starpos.night.together import FrameAnswer, Gathered, TurnedNight, from_elevations, together, turned
+from starpos.night.together import (
+    FrameAnswer,
+    Gathered,
+    Together,
+    from_elevations,
+    together,
+    turned,
+)
 from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import utc_text
@@ -56,10 +65,12 @@ def tell(
     place: the known place, whose headings are then reported; None without one.
     work: on the frames, which may say which focal length fits those that were not identified.
     """
-    statuses = [] if answers.turned is None else [tell_turned(args, folder, answers.turned)]
+    statuses = []
+    if answers.turned is not None:
+        statuses.append(tell_turned(args, folder, answers.turned, answers.remarks))
     watched, gathered, complaints = answers.watched, Gathered(), console.FrameComplaints()
     if watched is not None:
-        say(folder, *watched.remarks)
+        console.complain_of(folder, *answers.remarks)
         if args.learned is not None:
             _save_learned(Path(args.learned), watched.learned)
     for answer in answers.each:
@@ -77,7 +88,7 @@ def tell(
     unnamed = ""
     if fixes and watched is not None and answers.instrument is not None:
         unnamed = unnamed_inclinometer(answers.instrument)
-    say(folder, whole.why_not, unnamed, *whole.remarks, why)
+    console.complain_of(folder, whole.why_not, unnamed, *whole.remarks, why)
     where = whole.average or (fixes[-1] if fixes else None)
     about = fix_output.about_average(args, where, vertical, near)
     if place is not None:
@@ -87,7 +98,7 @@ def tell(
     if where is not None or (headings and place is not None):
         fix_output.put_combined(output, folder, whole.average, gathered, vertical, about, mean)
     elif gathered.lost is not None and not headings and work is not None:
-        say(folder, work.fitting(gathered.lost))
+        console.complain_of(folder, work.fitting(gathered.lost))
     # without tilts headings are all that was asked for, and by day they are all there is
     by_day = any(s.bodies for s in headings)
     found = bool(headings) if place is not None and (by_day or not args.tilt) else whole.average is not None
@@ -129,23 +140,19 @@ def check_save(args: argparse.Namespace, instrument: Instrument) -> None:
         instrument_file.check_fits(Path(args.save), instrument)
 
 
-def tell_turned(args: argparse.Namespace, folder: str | None, turned: TurnedNight) -> int:
+def tell_turned(
+    args: argparse.Namespace, folder: str | None, turned: Calibrated, remarks: Sequence[str]
+) -> int:
     """Say what was found by turning, and write A3 as --save asks; NOTHING if it is asked for and not written."""
-    if turned.calibrated is None or not turned.worth_saving:
-        say(folder, *turned.remarks, *([] if args.save is None else [f"{args.save} is not written"]))
+    if not worth_saving(turned):
+        console.complain_of(folder, *remarks, *([] if args.save is None else [f"{args.save} is not written"]))
         return 0 if args.save is None else console.NOTHING
     if args.save is not None:
-        about = f"A3 by turning on the spot, {turned.remarks[0]}"
-        overwriting.save_instrument(args.save, turned.calibrated.instrument, about)
+        about = f"A3 by turning on the spot, {remarks[0]}"
+        overwriting.save_instrument(args.save, turned.instrument, about)
     kept = "--save OUT keeps A3 and its errors" if args.save is None else f"{args.save} is written"
-    say(folder, *turned.remarks, kept)
+    console.complain_of(folder, *remarks, kept)
     return 0
-
-
-def say(folder: str | None, *texts: object) -> None:
-    """Print lines about a whole night on standard error."""
-    for text in filter(None, texts):
-        console.complain(text if folder is None else f"{folder}: {text}")
 
 
 def how_of(args: argparse.Namespace) -> How:
@@ -178,8 +185,8 @@ def json_of_watched(answer: FrameAnswer) -> dict:
     if (at_place := solution.at_place) is not None:
         keys = fix_output.with_heading(keys, at_place, at_place.place)
     check = None if told is None else told.compared
-    about = ("status", "distance_m", "bearing_deg", "sigma_m")
-    return keys | {"gnss": None if check is None else {name: getattr(check, name) for name in about}}
+    about = None if check is None else console.values(check, "status distance_m bearing_deg sigma_m")
+    return keys | {"gnss": about}
 
 
 def run_pointings(args: argparse.Namespace) -> int:
@@ -198,14 +205,17 @@ def run_pointings(args: argparse.Namespace) -> int:
     output = console.Output(args, "fix" if whole else "elevations")
     if not whole:
         return _from_elevations(args, output, solver, tilts, pointings, vertical, near)
-    found, given = None, solver.instrument if not args.self_calibrate else None
+    found: Calibrated | None = None
+    said: tuple[str, ...] = ()
+    given = solver.instrument if not args.self_calibrate else None
     solutions: Iterable[Solution] = (solver.solve_pointing(p, tilts) for p in pointings)
     if args.self_calibrate:
-        found = turned(solver, whole, tilts, options.turn_of(args))
+        found, said = turned(solver, whole, tilts, options.turn_of(args))
         solved = iter(found.solutions)
         solutions = [next(solved) if p.has_roll else solver.solve_pointing(p) for p in pointings]
     each = (FrameAnswer(p.source, s) for p, s in zip(pointings, solutions, strict=True))
-    return tell(args, output, None, NightAnswers(each, given=given, turned=found), vertical)
+    answers = NightAnswers(each=each, given=given, turned=found, remarks=said)
+    return tell(args, output, None, answers, vertical)
 
 
 def _from_elevations(
@@ -218,16 +228,14 @@ def _from_elevations(
     near: Near | None,
 ) -> int:
     """Print each row's zenith distance and the place that they give together; returns the exit status."""
-    found, saving = from_elevations(solver, pointings, tilts, near, args.self_calibrate), 0
-    status = fix_output.tell_elevations(
-        args, output, pointings, found.circles, found.together, vertical, near
-    )
-    if found.axis is not None:
+    circles, whole = from_elevations(solver, pointings, tilts, near, args.self_calibrate)
+    status, saving = fix_output.tell_elevations(args, output, pointings, circles, whole, vertical, near), 0
+    if whole.axis is not None:
         console.complain(
-            f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec"
+            f"A3 from the elevations: the frame's centre in the inclinometer to {whole.axis.stddev_arcsec:.0f} arcsec"
         )
     if args.save is not None:
-        saving = _save_axis(args, solver, found.axis)
+        saving = _save_axis(args, solver, whole.axis)
     return max(saving, status)
 
 
@@ -242,9 +250,36 @@ def _save_axis(args: argparse.Namespace, solver: Solver, axis: FoundAxis | None)
     return 0
 
 
+def _run_sights(args: argparse.Namespace) -> int:
+    """Solve the table of --sights; returns the exit status."""
+    if args.frames:
+        raise InstrumentError("give either frames or --sights CSV, not both")
+    sights, near, vertical = read_sights(args.sights), inputs.near_of(args), options.vertical_of(args)
+    clock_s = UNKNOWN_CLOCK_S if args.clock_stddev is None else args.clock_stddev
+    air = options.atmosphere_of(args)
+    ephemeris = options.ephemeris_of(args)
+    output = console.Output(args, "elevations")
+    circles: list[Circle | StarposError] = []
+    for sight in sights:
+        try:
+            circles.append(circle_of_sight(sight, catalogue.load_catalogue(), air, clock_s, ephemeris))
+        except StarposError as error:
+            circles.append(error)
+    whole = Together()
+    sound = [(s, c) for s, c in zip(sights, circles, strict=True) if isinstance(c, Circle)]
+    if sound:
+        try:
+            used, seen = zip(*sound, strict=True)
+            place = place_of_sights(used, seen, None if near is None else near.place)
+            whole = Together.by_circles(place, near)
+        except StarposError as error:
+            whole = Together(None, str(error))
+    return fix_output.tell_elevations(args, output, sights, circles, whole, vertical, near)
+
+
 def run(args: argparse.Namespace) -> int:
     if args.sights is not None:
-        return sights.run(args)
+        return _run_sights(args)
     if len(args.frames) == 1 and field.is_field(args.frames[0]):
         return _of_field(args)
     return _run(args)
@@ -288,7 +323,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
     nights = [night for night in given if isinstance(night, inputs.NightFolder)]
-    by_gravity = not needs_no_tilt and any(night.tilt is None for night in nights)
+    by_gravity = any(isinstance(night.tilt, ByGravity) for night in nights)
     by_log = args.tilt is not None and is_phone_log(Path(args.tilt)) and are_photographs(args.frames)
     read = inputs.reader_of(args, by_gravity or by_log)
     statuses = [_refused(why, given) for why in given if not isinstance(why, inputs.NightFolder)]
@@ -297,7 +332,7 @@ def _run(args: argparse.Namespace) -> int:
         abouts = do_calls((partial(read.first, levelled=by_gravity), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):
             try:
-                plans.append((night, _work(args, night, about, own_level, place, by_gravity)))
+                plans.append((night, _work(args, night, about, own_level, place)))
             except TiltError as error:
                 statuses.append(_refused(error, given))
         on_files = [partial(read.on, how.work(work)) for _, work in plans]
@@ -328,21 +363,17 @@ def _work(
     about: Stars | None,
     own_level: bool,
     place: Place | None,
-    by_gravity: bool,
 ) -> Solving:
     """The work on a night's frames, after complaints about what looks wrong; raises TiltError."""
     air = options.atmosphere_of(args)
     # without a frame that can be read, each one reports why it cannot
     if about is None:
         return Solving(Instruments(None), atmosphere=air)
-    tilt = Path(night.tilt) if night.tilt is not None else ByGravity() if by_gravity else None
-    work, remarks = work_of(inputs.given_or_sought(args, about), about, tilt, air, place)
+    work, remarks = work_of(inputs.given_or_sought(args, about), about, night.tilt, air, place)
     work = replace(work, ephemeris=options.ephemeris_of(args))
     console.complain(*remarks)
     assert work.instruments.instrument is not None
-    if work.instruments.sought:
-        BlindSolver(catalogue.load_catalogue(), console.ProgressBar()).prepare()
-        return work
-    check_save(args, work.instruments.instrument)
-    inputs.prepare(work.instruments.instrument, about)
+    if not work.instruments.sought:
+        check_save(args, work.instruments.instrument)
+    inputs.prepare(work.instruments, about)
     return replace(work, tilts=NO_TILTS) if own_level else work

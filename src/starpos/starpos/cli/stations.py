@@ -16,8 +16,7 @@ from starpos.zenith.stations import Station, against_grid, read_session, station
 def run(args: argparse.Namespace) -> int:
     stations = stations_of([read_session(path) for path in args.sessions])
     grid = None if args.geoid is None else geoid.read(args.geoid)
-    for station in stations:
-        console.complain(station.doubt)
+    console.complain(*(station.doubt for station in stations))
     values = [station_json(station, grid) for station in stations]
     if grid is not None and (without := [v["station"] for v in values if v["grid_arcsec"] is None]):
         console.complain(f"{args.geoid}: no data at {', '.join(without)}")

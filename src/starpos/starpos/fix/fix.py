@@ -279,7 +279,7 @@ def pointing_fix(pointing: Pointing, tilt: Tilt, about: Circumstances) -> Fix:
     stars = MatchedStars(
         xy,
         np.tile(np.eye(2) * spread, (RING_STARS, 1, 1)),
-        IDEAL.directions(*xy.T) @ _frame_to_icrs(pointing).T,
+        IDEAL.directions(*xy.T) @ frame_to_icrs(pointing.ra, pointing.dec, pointing.roll).T,
         np.zeros(RING_STARS),
     )
     seen = fit_stars(stars, IDEAL, to_level, about.atmosphere.refraction(), apparent(stars, about))
@@ -298,9 +298,8 @@ def pointing_fix(pointing: Pointing, tilt: Tilt, about: Circumstances) -> Fix:
     return levelled_fix(fields, a4, level, tilt, about, terms_of)
 
 
-def _frame_to_icrs(pointing: Pointing) -> np.ndarray:
-    """Rotation (3, 3) of the frame's axes into the axes of ICRS."""
-    ra, dec, roll = pointing.ra, pointing.dec, pointing.roll
+def frame_to_icrs(ra: float, dec: float, roll: float) -> np.ndarray:
+    """Rotation (3, 3) into ICRS of the axes of a frame with this centre, and this position angle of its top, in rad."""
     east, north = np.array([-np.sin(ra), np.cos(ra), 0.0]), rotation.unit_vector(ra, dec + np.pi / 2)
     centre, up = rotation.unit_vector(ra, dec), np.cos(roll) * north + np.sin(roll) * east
     return np.stack([np.cross(centre, up), -up, centre], 1)

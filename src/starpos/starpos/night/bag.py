@@ -3,7 +3,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from starpos.messages.camera import message_to_camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.messages.tilt import UNUSABLE, message_to_tilt
-from starpos.night.night import Truth
 from starpos.night.opening import truth_in
 from starpos.night.reading import Instruments
 from starpos.night.solving import Exposures, Worked
@@ -36,29 +35,6 @@ ROS1_SUFFIX = ".bag"
 WITH_STARS = (STARS, *IMAGES)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Recorded:
-    """One instrument's part of a bag.
-
-    drivers: how a robot's own messages are used.  cameras: by (width, height) of their frames in px.
-    star_count: star lists, or images that stars are detected in.
-    """
-
-    path: Path
-    namespace: str
-    drivers: Drivers
-    cameras: dict[tuple[int, int], Camera]
-    tilts: TiltLog | None
-    star_count: int
-    truth: Truth | None
-    remarks: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        """Name for headings: the bag's own, and the namespace if there is one."""
-        return self.path.name + (f" {self.namespace}" if self.namespace != "/" else "")
-
-
 def is_bag(path: Path) -> bool:
     """Whether a path looks like a bag: a folder with metadata.yaml or a bag's files, or a file with a bag's suffix."""
     if path.is_file():
@@ -66,14 +42,23 @@ def is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").is_file() or any(next(path.glob(f"*{s}"), None) for s in SUFFIXES)
 
 
-def read(
-    path: Path, namespace: str | None, tilt_noise_rad: float, drivers: Drivers, progress: Progress
-) -> Recorded:
-    """Read everything of one instrument, or of a robot's own drivers, except the stars.
+def exposures(
+    path: Path,
+    namespace: str | None,
+    drivers: Drivers,
+    given: Instruments,
+    atmosphere: Atmosphere,
+    vertical: Vertical,
+    progress: Progress,
+    own_cameras: bool = True,
+) -> Exposures:
+    """The stars of one instrument, or of a robot's own drivers, to be solved; everything else is read here.
 
-    namespace: the instrument's; None where there is only one.  tilt_noise_rad: sigma of readings that state none.
+    namespace: the instrument's; None where there is only one.  drivers: how a robot's own messages are used.
+    given: by its inclinometer, sigma of the readings that state none.  own_cameras: the bag's have their lenses.
     Raises BagError if the bag cannot be read, FrameError if the instrument is not in it.
     """
+    assert given.instrument is not None
     messages, cameras, why_no_camera = DriverMessages(drivers), dict[tuple[int, int], Camera](), ""
     tilts: list[Tilt] = []
     unusable = 0
@@ -97,35 +82,44 @@ def read(
                 continue
             # an impossible tilt only leads to a remark
             with suppress(TiltError):
-                tilt = message_to_tilt(message, tilt_noise_rad)
+                tilt = message_to_tilt(message, given.instrument.inclinometer.noise_rad)
                 if not message.flags & UNUSABLE:
                     tilts.append(tilt)
                     continue
             unusable += 1
-        remarks = (
-            f"{path.name}: {chosen.made}" if chosen.made else "",
-            *messages.remarks(),
-            f"{unusable} tilts of the bag were left out: flagged, out of range or broken" if unusable else "",
-            f"{path.name}: {why_no_camera}" if why_no_camera and not cameras else "",
-        )
-        tilts.sort(key=lambda tilt: tilt.utc_unix_s)
-        return Recorded(
-            path=path,
-            namespace=chosen.namespace,
-            drivers=drivers,
-            cameras=cameras,
-            tilts=TiltLog.of_readings(tilts) if tilts else None,
-            star_count=sum(c.msgcount for c in chosen.connections if c.msgtype in WITH_STARS),
-            truth=truth_in(path) if path.is_dir() else None,
-            remarks=tuple(filter(None, remarks)),
-        )
+    remarks = (
+        f"{path.name}: {chosen.made}" if chosen.made else "",
+        *messages.remarks(),
+        f"{unusable} tilts of the bag were left out: flagged, out of range or broken" if unusable else "",
+        f"{path.name}: {why_no_camera}" if why_no_camera and not cameras else "",
+    )
+    level: Tilts = TiltsByTime(why=f"{path}: no usable tilt in it: record the topic tilt too")
+    if tilts:
+        level = TiltLog.of_readings(sorted(tilts, key=lambda tilt: tilt.utc_unix_s))
+
+    def each(work: Callable[[Frame | Stars], Any]) -> Worked:
+        for name, item in _frames(path, chosen.namespace, drivers):
+            yield name, item if isinstance(item, FrameError) else work(item)
+
+    return Exposures(
+        name=path.name + (f" {chosen.namespace}" if chosen.namespace != "/" else ""),
+        origin=f"solved from stars and tilt of the bag {path.name}, namespace {chosen.namespace}",
+        count=sum(c.msgcount for c in chosen.connections if c.msgtype in WITH_STARS),
+        each=each,
+        work=Solving(
+            replace(given, cameras=cameras if own_cameras else {}), atmosphere=atmosphere, tilts=level
+        ),
+        vertical=vertical,
+        truth=truth_in(path) if path.is_dir() else None,
+        remarks=tuple(filter(None, remarks)),
+    )
 
 
-def each_frame(r: Recorded) -> Iterator[tuple[str, Stars | FrameError]]:
+def _frames(path: Path, namespace: str, drivers: Drivers) -> Iterator[tuple[str, Stars | FrameError]]:
     """A name for each frame, one at a time, and its stars, or why it has none."""
-    messages = DriverMessages(r.drivers)
-    with BagReader(r.path, typed=True) as bag:
-        chosen = instrument_in(bag, r.namespace, INPUTS, r.drivers.remaps)
+    messages = DriverMessages(drivers)
+    with BagReader(path, typed=True) as bag:
+        chosen = instrument_in(bag, namespace, INPUTS, drivers.remaps)
         wanted = [c for c in chosen.connections if c.msgtype in (*WITH_STARS, CAPTURE)]
         for connection, _, message in bag.decoded(wanted):
             if connection.msgtype == CAPTURE:
@@ -146,23 +140,3 @@ def _named_stars(kind: str, message: Any, messages: DriverMessages) -> tuple[str
     except StarposError as error:
         # the error of a list names it
         return name, FrameError(f"{error}" if kind == STARS else f"{name}: {error}")
-
-
-def exposures(r: Recorded, instruments: Instruments, atmosphere: Atmosphere, vertical: Vertical) -> Exposures:
-    """The stars of a bag, to be solved."""
-    tilts: Tilts = r.tilts or TiltsByTime(why=f"{r.path}: no usable tilt in it: record the topic tilt too")
-
-    def each(work: Callable[[Frame | Stars], Any]) -> Worked:
-        for name, item in each_frame(r):
-            yield name, item if isinstance(item, FrameError) else work(item)
-
-    return Exposures(
-        name=r.name,
-        origin=f"solved from stars and tilt of the bag {r.path.name}, namespace {r.namespace}",
-        count=r.star_count,
-        each=each,
-        work=Solving(instruments, atmosphere=atmosphere, tilts=tilts),
-        vertical=vertical,
-        truth=r.truth,
-        remarks=r.remarks,
-    )

@@ -53,33 +53,37 @@ def write(path: Path, exposures: Exposures, progress: Progress = quiet) -> int:
         raise FrameError(f"{exposures.name}: {EITHER_WAY}")
     if not isinstance(log, TiltLog):
         raise FrameError(f"{exposures.name}: no tilts: a field report needs the night's tilts")
-    lists: dict[str, bytes] = {}
-    instrument, unreadable = None, 0
-    with tempfile.TemporaryDirectory() as folder:
+    instrument, unreadable, packed = None, 0, io.BytesIO()
+    with tempfile.TemporaryDirectory() as base:
+        folder = Path(base)
         for k, (_, stars) in enumerate(exposures.each(stars_of)):
             progress(exposures.name[:20], (k + 1) / exposures.count)
             if isinstance(stars, FrameError) or stars.mid_unix_s is None or not stars.exposure_s:
                 unreadable += 1
                 continue
             instrument = _with_clock(instrument or exposures.work.instruments.of(stars), stars)
-            one = Path(folder) / f"stars_{k:04d}.csv"
-            write_star_list(one, stars, date_obs(stars.mid_unix_s - stars.exposure_s / 2))
-            lists[one.name] = one.read_bytes()
+            begin = date_obs(stars.mid_unix_s - stars.exposure_s / 2)
+            write_star_list(folder / f"stars_{k:04d}.csv", stars, begin)
         if instrument is None:
             raise FrameError(f"{exposures.name}: no frame of it has stars, a time and a known focal length")
-        instrument_file.write(Path(folder) / INSTRUMENT, instrument)
-        lists[INSTRUMENT] = (Path(folder) / INSTRUMENT).read_bytes()
-    lists[TILTS] = _tilt_table(log).encode()
-    lists[ABOUT] = json.dumps(_about(exposures, unreadable), indent=1).encode()
-    if exposures.truth is not None:
-        lists[TRUTH] = json.dumps(_truth(exposures.truth)).encode()
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
-        for name in sorted(lists):
-            # a date of its own would reveal the computer's clock and zone
-            file.writestr(zipfile.ZipInfo(name), lists[name], zipfile.ZIP_DEFLATED)
+        instrument_file.write(folder / INSTRUMENT, instrument)
+        (folder / TILTS).write_bytes(_tilt_table(log).encode())
+        (folder / ABOUT).write_bytes(json.dumps(_about(exposures, unreadable), indent=1).encode())
+        if exposures.truth is not None:
+            (folder / TRUTH).write_bytes(json.dumps(_truth(exposures.truth)).encode())
+        files = sorted(folder.iterdir())
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
+            for each in files:
+                # a date of its own would reveal the computer's clock and zone
+                file.writestr(zipfile.ZipInfo(each.name), each.read_bytes(), zipfile.ZIP_DEFLATED)
     save(path, packed.getvalue(), "the field report")
-    return sum(name.startswith("stars_") for name in lists)
+    return sum(each.name.startswith("stars_") for each in files)
+
+
+def check_name(path: str) -> None:
+    """Raise FrameError unless the name of --field ends as a field report's does."""
+    if not path.lower().endswith(SUFFIX):
+        raise FrameError(f"--field {path}: give it a name that ends in {SUFFIX}")
 
 
 def is_field(path: Path | str) -> bool:

@@ -6,21 +6,23 @@ The steps follow from the frames and the tilts alone, in their order, so reading
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
+from functools import partial
 
 import numpy as np
 
 from starpos import rotation
+from starpos.calibration.misalignment import Calibrated
 from starpos.earth.orientation import earth_state
 from starpos.errors import StarposError
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
-from starpos.frames.frame import SATURATED, Stars
+from starpos.frames.frame import SATURATED
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import TiltLog
-from starpos.night.together import TurnedNight, turned
+from starpos.night.remarks import worth_saving
+from starpos.night.together import turned
 
 # Widths of star images that the detector measures well, px.
 NARROWEST_PX, WIDEST_PX = 1.2, 4.0
@@ -42,16 +44,8 @@ OFF_SHARE, OFF_DEG = 0.1, 10.0
 TURN_STDDEV_DEG = 3.0
 HEADINGS, FRAMES_EACH, APART_DEG = 4, 3, 45.0
 BAR = 20
-
-
-class Stage(Enum):
-    """The steps, in their order."""
-
-    FOCUS = "focus"
-    EXPOSURE = "exposure"
-    LEVEL = "level"
-    HORIZON = "horizon"
-    TURN = "turn"
+# the step after which the clock is looked at
+LEVEL = "level"
 
 
 @dataclass(frozen=True)
@@ -74,15 +68,21 @@ class Standing:
 
 
 class FirstNight:
-    """Inspects the frames of a first night; `turned` is what the last step found.
+    """Inspects the frames of a first night; `turned` is what the last step found, once A3 is known.
 
     solver: with A3 as far as it is known.
     """
 
     def __init__(self, solver: Solver) -> None:
-        self.turned: TurnedNight | None = None
+        self.turned: Calibrated | None = None
         self._solver = solver
-        self._steps = list(Stage)
+        self._steps: list[tuple[str, Callable[[Sight, TiltLog | str], Look]]] = [
+            ("focus", self._focus),
+            ("exposure", self._exposure),
+            (LEVEL, self._level),
+            ("horizon", partial(self._with_pose, self._horizon)),
+            ("turn", partial(self._with_pose, self._turn)),
+        ]
         self._widths: list[float] = []
         self._base: Standing | None = None
         # Direction in which each lean moved up in S (rad), and its pose.
@@ -96,26 +96,19 @@ class FirstNight:
         return self._solver.instrument
 
     @property
-    def step(self) -> Stage | None:
-        """The step that the next frame is for; None after the last."""
-        return self._steps[0] if self._steps else None
+    def step(self) -> str:
+        """The step that the next frame is for; '' after the last."""
+        return self._steps[0][0] if self._steps else ""
 
     def inspect(self, sight: Sight, log: TiltLog | str) -> Look:
         """Inspect the next frame, identified, with the tilts so far, or a sentence on why they are missing."""
-        looks: dict[Stage, Callable[[], Look]] = {
-            Stage.FOCUS: lambda: self._focus(sight.stars),
-            Stage.EXPOSURE: lambda: self._exposure(sight),
-            Stage.LEVEL: lambda: self._level(sight.stars, log),
-            Stage.HORIZON: lambda: self._with_pose(sight, log, self._horizon),
-            Stage.TURN: lambda: self._with_pose(sight, log, self._turn),
-        }
-        look = looks[self._steps[0]]()
+        look = self._steps[0][1](sight, log)
         if look.done:
             self._steps.pop(0)
         return look
 
-    def _focus(self, stars: Stars) -> Look:
-        width = stars.fwhm_px
+    def _focus(self, sight: Sight, _: TiltLog | str) -> Look:
+        width = sight.stars.fwhm_px
         if width is None or not width > 0:
             return Look(False, "no width of stars", "check cap, clouds and exposure")
         self._widths.append(width)
@@ -131,7 +124,7 @@ class FirstNight:
             return Look(False, found, f"turn the focus ring a little, until it is under {WIDEST_PX:g} px")
         return Look(False, found, "hands off for some frames")
 
-    def _exposure(self, sight: Sight) -> Look:
+    def _exposure(self, sight: Sight, _: TiltLog | str) -> Look:
         stars = sight.stars
         flags = stars.flags[:BRIGHTEST]
         saturated = np.count_nonzero(flags & SATURATED) / max(len(flags), 1)
@@ -150,11 +143,11 @@ class FirstNight:
             return Look(False, found, sight.solution.message)
         return Look(True, f"{found}, {len(sight.found.star)} identified", "keep exposure and gain")
 
-    def _level(self, stars: Stars, log: TiltLog | str) -> Look:
+    def _level(self, sight: Sight, log: TiltLog | str) -> Look:
         if isinstance(log, str):
             return Look(False, log, "connect the inclinometer")
         end = log.utc_unix_s[-1]
-        late_s = (stars.mid_unix_s or 0.0) - end
+        late_s = (sight.stars.mid_unix_s or 0.0) - end
         near = log.utc_unix_s > end - LEVEL_S
         if late_s > LEVEL_S or np.ptp(log.utc_unix_s[near]) < 0.8 * LEVEL_S:
             return Look(False, f"no tilts over {LEVEL_S:.0f} s yet", "leave the instrument alone")
@@ -168,7 +161,7 @@ class FirstNight:
             return Look(False, found, "wait until nothing moves: a firm ground, no wind, no hands")
         return Look(True, found, "the level is still")
 
-    def _with_pose(self, sight: Sight, log: TiltLog | str, look: Callable[[Standing], Look]) -> Look:
+    def _with_pose(self, look: Callable[[Standing], Look], sight: Sight, log: TiltLog | str) -> Look:
         if isinstance(log, str):
             return Look(False, log, "connect the inclinometer")
         mid = sight.stars.mid_unix_s
@@ -273,10 +266,11 @@ class FirstNight:
             np.full(len(ups), np.nan),
             self._solver.instrument.inclinometer.noise_rad,
         )
-        self.turned = turned(solver, frames, log, TURN_STDDEV_DEG)
-        said = f"{found}; {'; '.join(self.turned.remarks)}"
-        if not self.turned.worth_saving:
+        a3, remarks = turned(solver, frames, log, TURN_STDDEV_DEG)
+        said = f"{found}; {'; '.join(remarks)}"
+        if not worth_saving(a3):
             return Look(False, said, "turn on, to other headings")
+        self.turned = a3
         return Look(True, said, "A3 is known")
 
 

@@ -11,7 +11,7 @@ from starpos.errors import FrameError
 from starpos.files import save
 from starpos.fix.searching import Sight
 from starpos.instrument.camera import Camera
-from starpos.night.extinction import air_mass
+from starpos.night.watching import air_mass
 from starpos.sky.catalogue import Catalogue
 from starpos.tables import TableForm
 

@@ -17,7 +17,8 @@ from starpos.fix.solution import FieldPointing, Solution, Status
 from starpos.frames.frame import Stars
 
 if TYPE_CHECKING:
-    from starpos.night.beside_gnss import WatchedNight
+    from starpos.gnss.solving import Watched
+    from starpos.gnss.states import Learned
 
 NO_TILT = (float("nan"), float("nan"))
 NO_STARS = np.zeros((0, 2))
@@ -132,6 +133,15 @@ def offset_m(place: PlaceFix | Truth, latitude: float, longitude: float) -> tupl
     return float(east), float(north)
 
 
+@dataclass(frozen=True)
+class WatchedNight:
+    """The answer to each frame in the given order; what GNSS taught by the end; remarks."""
+
+    answers: "tuple[Watched, ...]"
+    learned: "Learned | None"
+    remarks: tuple[str, ...]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Night:
     """All frames of one place; printed, and in a notebook shown, in a few lines.
@@ -160,7 +170,7 @@ class Night:
     atmosphere: Atmosphere
     truth: Truth | None = None
     steady: np.ndarray | None = None
-    watched: "WatchedNight | None" = None
+    watched: WatchedNight | None = None
     remarks: tuple[str, ...] = ()
 
     @property

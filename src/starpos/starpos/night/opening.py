@@ -60,21 +60,20 @@ def exposures(
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
     frames, read = frames or frames_in(folder), read or Reader()
-    tilts: Path | ByGravity = folder / TILTS
-    if place is None and not (folder / TILTS).exists() and are_photographs(frames):
+    tilts: Path | ByGravity | None = folder / TILTS
+    if not (folder / TILTS).exists() and (place is not None or are_photographs(frames)):
+        tilts = None if place is not None else ByGravity()
+    if by_gravity := isinstance(tilts, ByGravity):
         # a new reader, which has not kept a frame without its time
-        tilts, read = ByGravity(), Reader(read.clock or CameraClock(), read.delay_s)
-    by_gravity = isinstance(tilts, ByGravity)
+        read = Reader(read.clock or CameraClock(), read.delay_s)
     first = read.first(list(map(str, frames)), by_gravity)
     work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[str, ...]()
     if first is not None:
         try:
             work, remarks = work_of(given, first, tilts, atmosphere, place)
         except TiltError as error:
-            none = place is not None and not (folder / TILTS).exists()
-            instruments, doubt = given.framed(first)
-            remarks = (doubt,) if doubt else ()
-            work = replace(work, instruments=instruments, tilts=None if none else TiltsByTime(why=str(error)))
+            work, remarks = work_of(given, first, None, atmosphere, place)
+            work = replace(work, tilts=TiltsByTime(why=str(error)))
 
     def each(work: Callable[[Frame | Stars], Any]) -> Worked:
         answers = in_turn((partial(read.on, work), str(path)) for path in frames)

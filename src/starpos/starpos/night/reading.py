@@ -60,6 +60,14 @@ class Reader:
                 first = first or about
         return first
 
+    def one_of(self, paths: Sequence[str]) -> Stars:
+        """The star list as by `first`; raises the FrameError of the first path if none can be read."""
+        about = self.first(paths)
+        if about is None:
+            self(paths[0])
+        assert about is not None
+        return about
+
     def on(self, work: Callable[[Frame | Stars], Any], path: str) -> Any:
         """What a work makes of the frame or list in a file."""
         return work(self(path))

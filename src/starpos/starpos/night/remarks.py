@@ -54,11 +54,8 @@ def of_gravity(instrument: Instrument, by_log: bool = False) -> str:
     return f"the level is {where}; time, zone and lens are the files', and their GPS is only compared"
 
 
-def of_marks(place: Fix | Average, marks_deg: Sequence[tuple[float, float]]) -> str:
-    """Compare a place with the first of those that GPS wrote into the frames' files, deg on WGS 84."""
-    if not marks_deg:
-        return ""
-    mark = Near(*np.radians(marks_deg[0]).tolist())
+def of_mark(place: Fix | Average, mark: "Near") -> str:
+    """Compare a place with the one that GPS wrote into a frame's file, on WGS 84."""
     off = np.array([half_turn(place.longitude - mark.longitude), place.latitude - mark.latitude])
     off *= EARTH_RADIUS_M * np.array([np.cos(mark.latitude), 1.0])
     sigmas = float(np.sqrt(off @ np.linalg.solve(place.covariance[:2, :2], off)))
@@ -161,10 +158,15 @@ def of_denied_a3(axis: FoundAxis, given: Calibration) -> str:
     )
 
 
+def worth_saving(turned: Calibrated) -> bool:
+    """Whether the headings determine A3."""
+    return turned.plumb_stddev_arcsec <= WORTH_SAVING_ARCSEC
+
+
 def of_turn(turned: Calibrated) -> Iterator[str]:
     """Say how well A3 was found by turning."""
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
-    if turned.plumb_stddev_arcsec > WORTH_SAVING_ARCSEC:
+    if not worth_saving(turned):
         yield (f"not calibrated: the headings hardly determine A3, {error}: turn it further")
         return
     found = turned.instrument.calibration
@@ -220,9 +222,14 @@ class Near:
     stated_by: str = "--near"
     either_sign: bool = False
 
+    @property
+    def place(self) -> tuple[float, float]:
+        """Latitude and longitude in rad."""
+        return self.latitude, self.longitude
+
     def km_from(self, latitude: float, longitude: float) -> float:
         """Distance in km, on a sphere, to a place in rad."""
-        return apart_m((self.latitude, self.longitude), (latitude, longitude)) / 1000
+        return apart_m(self.place, (latitude, longitude)) / 1000
 
 
 def doubts(
@@ -300,12 +307,8 @@ def _places(a3: np.ndarray | None, frames: Sequence[Leaning]) -> list[tuple[str,
     for name, corrected in MISTAKES:
         angles = corrected(theta)
         if np.abs(angles).max() < np.pi / 2:
-            found.append(
-                (
-                    name,
-                    [_place(camera, one, a3) for (camera, _), one in zip(frames, angles, strict=True)],
-                )
-            )
+            places = [_place(camera, one, a3) for (camera, _), one in zip(frames, angles, strict=True)]
+            found.append((name, places))
     return found
 
 

@@ -4,34 +4,38 @@
 Frames are solved one by one, or all together: by turning, or compared with GNSS.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starpos.calibration.misalignment import Calibrated
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
-from starpos.errors import FrameError
+from starpos.errors import FrameError, GnssError
 from starpos.fix.attitude import heading_of
 from starpos.fix.budget import local_north
 from starpos.fix.glows import Glow
 from starpos.fix.searching import Sight, of_one_camera
+from starpos.fix.solution import Solution
+from starpos.fix.solver import Solver, placed
 from starpos.frames.frame import Frame, Stars
 from starpos.identification.prior import Hint
 from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.tilt_log import NO_TILTS
-from starpos.night.night import Night, Shot, Truth, why_none
-from starpos.night.together import FrameAnswer, Gathered, TurnedNight, together, turned
+from starpos.instrument.tilt_log import NO_TILTS, Tilts
+from starpos.night.night import Night, Shot, Truth, WatchedNight, why_none
+from starpos.night.together import FrameAnswer, Gathered, together, turned
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
 from starpos.rotation import half_turns
 
 if TYPE_CHECKING:
     from starpos.gnss.receiver import GnssTrack
+    from starpos.gnss.solving import Watched
     from starpos.gnss.states import Learned
-    from starpos.night.beside_gnss import WatchedNight
 
 # if readings are further from their median than this, the camera was moved
 STILL_SIGMA = 8.0
@@ -83,19 +87,21 @@ class How:
 ONE_BY_ONE = How()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class NightAnswers:
     """The answers of a night; each: one for each frame, in order, as soon as it is there.
 
     instrument: on which they rest; None without a frame.
     given: the instrument whose A3 was used unchanged; None where it was found, or taught by GNSS.
+    turned: A3 found by turning.  remarks: on what was found or taught.
     """
 
     each: Iterable[FrameAnswer]
     instrument: Instrument | None = None
     given: Instrument | None = None
-    turned: TurnedNight | None = None
-    watched: "WatchedNight | None" = None
+    turned: Calibrated | None = None
+    watched: WatchedNight | None = None
+    remarks: tuple[str, ...] = ()
 
 
 def answers_of(
@@ -108,26 +114,21 @@ def answers_of(
     """Answer the frames of a night, by name; sights: what `how.work(asked)` gave of each."""
     if how.one_by_one:
         known = asked.instruments.instrument
-        return NightAnswers(_without_lamps(_one_by_one(sights, asked)), known, known)
+        return NightAnswers(each=_without_lamps(_one_by_one(sights, asked)), instrument=known, given=known)
     rows = list(sights)
     seen = [sight for _, sight in rows if isinstance(sight, Sight)]
     if not seen:
-        return NightAnswers(_in_order(rows, ()))
+        return NightAnswers(each=_in_order(rows, ()))
     solver = replace(asked.solver(seen[0].stars), progress=progress)
     solver, alike = of_one_camera(solver, seen)
     if how.gnss is not None:
-        from starpos.night.beside_gnss import watched_night
-
-        watched = watched_night(solver, alike, asked.tilts, how.gnss, how.learned, vertical)
-        answers = [
-            FrameAnswer("", a.solution, s.stars, a) for a, s in zip(watched.answers, alike, strict=True)
-        ]
-        return NightAnswers(_in_order(rows, answers), solver.instrument, watched=watched)
+        watched = _watched_night(solver, alike, asked.tilts, how.gnss, how.learned, vertical)
+        each = _in_order(rows, ((a.solution, a) for a in watched.answers))
+        return NightAnswers(each=each, instrument=solver.instrument, watched=watched, remarks=watched.remarks)
     assert how.turn_stddev_deg is not None
-    found = turned(solver, alike, asked.tilts or NO_TILTS, how.turn_stddev_deg)
-    answers = [FrameAnswer("", a, s.stars) for a, s in zip(found.solutions, alike, strict=True)]
-    instrument = solver.instrument if found.calibrated is None else found.calibrated.instrument
-    return NightAnswers(_in_order(rows, answers), instrument, turned=found)
+    found, said = turned(solver, alike, asked.tilts or NO_TILTS, how.turn_stddev_deg)
+    each = _in_order(rows, ((s, None) for s in found.solutions))
+    return NightAnswers(each=each, instrument=found.instrument, turned=found, remarks=said)
 
 
 def _one_by_one(sights: Iterable[tuple[str, Sight | FrameError]], asked: Solving) -> Iterator[FrameAnswer]:
@@ -153,41 +154,76 @@ def _without_lamps(answers: Iterable[FrameAnswer]) -> Iterator[FrameAnswer]:
     proven = False
     for answer in answers:
         glow = answer.solution.glow
-        if glow is None:
-            held.append(answer)
-        else:
-            before = [a.solution.glow for a in held if a.solution.glow is not None]
-            first = lamp or next(iter(before), None)
-            stood = [g.stood_still(glow) for g in ([first, *before[-1:]] if first else [])]
-            still = next((s for s in stood if s is not None), None)
-            if still and first is not None:
-                lamp = first
-                answer = replace(answer, solution=answer.solution.as_lamp(first.utc_unix_s))
-                held = [replace(a, solution=a.solution.as_lamp(glow.utc_unix_s)) for a in held]
-            elif still is False:
-                yield from held
-                held, lamp, proven = [], None, True
-            held.append(answer)
-        if lamp is not None or all(a.solution.glow is None for a in held):
-            yield from held
+        before = [a.solution.glow for a in held if a.solution.glow is not None]
+        first = lamp or next(iter(before), None)
+        stood = [] if glow is None or first is None else [g.stood_still(glow) for g in (first, *before[-1:])]
+        still = next((s for s in stood if s is not None), None)
+        if still and glow is not None and first is not None:
+            lamp = first
+            for a in held:
+                yield replace(a, solution=a.solution.as_lamp(glow.utc_unix_s))
             held = []
+            yield replace(answer, solution=answer.solution.as_lamp(first.utc_unix_s))
+        elif still is False:
+            yield from held
+            held, lamp, proven = [answer], None, True
+        elif glow is None and not held:
+            yield answer
+        else:
+            held.append(answer)
     for answer in held:
         yield replace(answer, solution=answer.solution if proven else answer.solution.unproven())
 
 
 def _in_order(
-    rows: Iterable[tuple[str, Sight | FrameError]], answers: Iterable[FrameAnswer]
+    rows: Iterable[tuple[str, Sight | FrameError]], answers: Iterable[tuple[Solution, "Watched | None"]]
 ) -> Iterator[FrameAnswer]:
-    """The answer to each frame; answers: to those that can be read, in order."""
+    """The answer to each frame; answers: to those that can be read, in order, and how they compare with GNSS."""
     following = iter(answers)
     for name, sight in rows:
         if isinstance(sight, FrameError):
             yield FrameAnswer.unreadable(name, sight)
             continue
-        answer = replace(next(following), name=name)
+        solution, watched = next(following)
         # a header's wrong focal length was noticed when the frame was identified
-        remark = answer.solution.remark or sight.solution.remark
-        yield replace(answer, solution=replace(answer.solution, remark=remark))
+        solution = replace(solution, remark=solution.remark or sight.solution.remark)
+        yield FrameAnswer(name, solution, sight.stars, watched)
+
+
+def _watched_night(
+    solver: Solver,
+    sights: Sequence[Sight],
+    tilts: Tilts | None,
+    track: "GnssTrack",
+    before: "Learned | None",
+    vertical: Vertical,
+) -> WatchedNight:
+    """Solve a night's frames, which are identified already, in the order of their times.
+
+    tilts: None where headings alone are wanted.  before: what earlier nights learned of the instrument.
+    """
+    from starpos.gnss.solving import watched
+    from starpos.gnss.watch import GnssWatch
+
+    watch = GnssWatch(solver.instrument, vertical, before)
+    said: Counter[str] = Counter()
+    answers: dict[int, Watched] = {}
+    for k in sorted(range(len(sights)), key=lambda k: sights[k].stars.mid_unix_s or 0.0):
+        stars, rough, gnss = sights[k].stars, sights[k].solution, None
+        if stars.mid_unix_s is not None:
+            try:
+                gnss = track.at(stars.mid_unix_s)
+            except GnssError as error:
+                said[str(error)] += 1
+        if rough.found is not None and tilts is not None:
+            solved = solver.solve(stars, tilts, known=rough.found)
+            refused = replace(rough, status=solved.status, message=solved.message)
+            rough = refused if solved.found is None else solved
+        if gnss is not None:
+            rough = placed(solver, stars, rough, gnss.deflected(vertical))
+        answers[k] = watched(solver, stars, rough, gnss, watch)
+    remarks = tuple(f"{number} frames: {why}" for why, number in said.items())
+    return WatchedNight(tuple(answers[k] for k in range(len(sights))), watch.learned, remarks)
 
 
 def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress = quiet) -> Night:
@@ -201,12 +237,9 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
         of_frames.append(answer.solution.remark)
         progress(exposures.name[:20], done / exposures.count)
     whole = together(gathered, answers.given)
-    said = [
-        remark for part in (answers.turned, answers.watched) if part is not None for remark in part.remarks
-    ]
     if gathered.lost is not None and not gathered.solved:
         of_frames.append(work.fitting(gathered.lost))
-    night = Night(
+    return Night(
         name=exposures.name,
         origin=exposures.origin,
         shots=shots,
@@ -215,20 +248,18 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
         vertical=exposures.vertical,
         atmosphere=exposures.work.atmosphere,
         truth=exposures.truth,
+        steady=_steady(shots, answers.instrument) if whole.average and answers.instrument else None,
         watched=answers.watched,
-        remarks=(*exposures.remarks, *said, *filter(None, of_frames), *whole.remarks),
+        remarks=(*exposures.remarks, *answers.remarks, *filter(None, of_frames), *whole.remarks),
     )
-    if night.combined is None or answers.instrument is None:
-        return night
-    return replace(night, steady=_steady(night, answers.instrument))
 
 
-def _steady(night: Night, instrument: Instrument) -> np.ndarray | None:
+def _steady(shots: Sequence[Shot], instrument: Instrument) -> np.ndarray | None:
     """Places (N, 3) for Night.steady, each with the mean tilt of the night; None if the camera was moved."""
-    tilts = np.array([s.tilt for _, s in night.fixed])
-    headings = np.array([p.heading for p in night.places])
-    own = np.array([p.own for p in night.places])
-    attitudes = [s.camera_to_itrs for _, s in night.fixed if s.camera_to_itrs is not None]
+    tilts = np.array([s.tilt for s in shots if s.place])
+    headings = np.array([s.place.heading for s in shots if s.place])
+    own = np.array([s.place.own for s in shots if s.place])
+    attitudes = [s.camera_to_itrs for s in shots if s.camera_to_itrs is not None]
     moved = np.abs(tilts - np.median(tilts, axis=0)).max() * EARTH_RADIUS_M
     noise = np.sqrt(np.median(np.trace(own[:, :2, :2], axis1=1, axis2=2) / 2))
     turned = np.abs(half_turns(headings - headings[0])).max()

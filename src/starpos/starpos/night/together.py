@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a night's frames give together: an average, A3 by turning, a place from elevations; and doubts."""
 
+import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -59,15 +60,14 @@ class Gathered:
 
     solved: those with a fix, without the details of each star; headings: those with a heading at a known place;
     circles: of those that saw the Sun, which serve where nothing is solved; warnings: of all, each once.
-    marks_deg: the places that GPS wrote into the files of those with a fix.
-    site: of the header of the first of them that states one.
+    mark, site: of the first with a fix that has one: where GPS put it by its file, and the site of its header.
     lost: the stars of the first frame that was not identified; None without one.
     unreadable: whether a file was.
     """
 
     def __init__(self) -> None:
         self.solved: list[Solution] = []
-        self.marks_deg: list[tuple[float, float]] = []
+        self.mark: Near | None = None
         self.site: Near | None = None
         self.headings: list[Solution] = []
         self.circles: list[Circle] = []
@@ -83,11 +83,12 @@ class Gathered:
         if s.fix:
             light = replace(s.fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
             self.solved.append(replace(s, fix=light, star=None, found=None, hint=None, at_place=None))
-            if answer.stars is not None and answer.stars.gps_deg is not None:
-                self.marks_deg.append(answer.stars.gps_deg)
-            if answer.stars is not None and answer.stars.site_deg is not None and self.site is None:
-                latitude, longitude = np.radians(answer.stars.site_deg).tolist()
-                stated_by = f"the header's {answer.stars.site_cards}"
+            stars = answer.stars
+            if stars is not None and stars.gps_deg is not None and self.mark is None:
+                self.mark = Near(*np.radians(stars.gps_deg).tolist())
+            if stars is not None and stars.site_deg is not None and self.site is None:
+                latitude, longitude = np.radians(stars.site_deg).tolist()
+                stated_by = f"the header's {stars.site_cards}"
                 self.site = Near(latitude, longitude, stated_by=stated_by, either_sign=True)
         if s.at_place:
             self.headings.append(s)
@@ -104,11 +105,21 @@ class Gathered:
 
 @dataclass(frozen=True)
 class Together:
-    """The average of a night's fixes, None if it is missing, as why_not says; and remarks on it."""
+    """The average of a night's fixes, None if it is missing, as why_not says; and remarks on it.
+
+    axis: A3's, which elevations determined too; None if A3 was known well enough or they do not determine it.
+    """
 
     average: Average | None = None
     why_not: str = ""
     remarks: tuple[str, ...] = ()
+    axis: FoundAxis | None = None
+
+    @classmethod
+    def by_circles(cls, place: Average, near: Near | None) -> "Together":
+        """The place where circles meet, and what looks wrong with it."""
+        said = *remarks.of_average(place), *doubts((), place, None, near)
+        return cls(place, "", tuple(filter(None, said)))
 
 
 def together(gathered: Gathered, given: Instrument | None, near: Near | None = None) -> Together:
@@ -135,10 +146,8 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
             a3 = given.calibration.a3
         said += [] if whole is None else [remarks.of_table(fixes, whole, given)]
         said += [remarks.of_copies(fixes)] if given.has_level_inside else []
-    said += [
-        remarks.of_marks(place, gathered.marks_deg),
-        *doubts(fixes, place, a3, near or gathered.site),
-    ]
+    said += [] if gathered.mark is None else [remarks.of_mark(place, gathered.mark)]
+    said += doubts(fixes, place, a3, near or gathered.site)
     return Together(whole, why_not, tuple(filter(None, said)))
 
 
@@ -150,34 +159,18 @@ def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
                 "the Sun's elevations determine a place only where A3 is known to 6 arcmin: find it by night with "
                 "starpos calibrate --site"
             )
-        place, _ = place_of_discs(circles, None if near is None else (near.latitude, near.longitude))
+        place, _ = place_of_discs(circles, None if near is None else near.place)
     except FixError as error:
         return Together(None, str(error))
-    said = *remarks.of_average(place), *doubts((), place, None, near)
-    return Together(place, "", tuple(filter(None, said)))
-
-
-@dataclass(frozen=True)
-class TurnedNight:
-    """A night whose A3 was found by turning: the solution of each frame, A3, None if it was not found, and remarks."""
-
-    solutions: tuple[Solution, ...]
-    calibrated: Calibrated | None = None
-    remarks: tuple[str, ...] = ()
-
-    @property
-    def worth_saving(self) -> bool:
-        """Whether the headings determine A3."""
-        return self.calibrated is not None and (
-            self.calibrated.plumb_stddev_arcsec <= remarks.WORTH_SAVING_ARCSEC
-        )
+    return Together.by_circles(place, near)
 
 
 def turned(
     solver: Solver, frames: Sequence[Sight | Pointing], tilts: Tilts, turn_stddev_deg: float
-) -> TurnedNight:
-    """Find A3 and the fixes of a night's frames, which are identified already; one that was not keeps its solution.
+) -> tuple[Calibrated, tuple[str, ...]]:
+    """Find A3 and the fixes of a night's frames, which are identified already; and remarks on how well it was found.
 
+    One that was not identified keeps its solution. Where the frames do not agree, nothing is known of the plumb line.
     turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line.
     """
 
@@ -193,23 +186,12 @@ def turned(
     try:
         found = turn(solver, items, tilts, turn_stddev_deg, solver.progress, known)
     except FixError as error:
-        return TurnedNight(all_of(Solution.failed(item, Status.POOR_FIT, str(error)) for item in items))
+        none = all_of(Solution.failed(item, Status.POOR_FIT, str(error)) for item in items)
+        return Calibrated(solver.instrument, math.inf, none), ()
     said = list(remarks.of_turn(found))
     if any(s.fix is not None for s in found.solutions):
         said.append(unnamed_inclinometer(solver.instrument))
-    return TurnedNight(all_of(found.solutions), found, tuple(filter(None, said)))
-
-
-@dataclass(frozen=True)
-class Elevations:
-    """Each pointing's circle on which its place lies, or the error; the place of all.
-
-    axis: A3 whose axis the elevations determined too; None if A3 was known well enough or they do not determine it.
-    """
-
-    circles: tuple[Circle | StarposError, ...]
-    together: Together
-    axis: FoundAxis | None = None
+    return replace(found, solutions=all_of(found.solutions)), tuple(filter(None, said))
 
 
 def from_elevations(
@@ -218,8 +200,8 @@ def from_elevations(
     tilts: Tilts,
     near: Near | None = None,
     self_calibrate: bool = False,
-) -> Elevations:
-    """Find the place of pointings, and A3's axis where it is not known to a few arcmin.
+) -> tuple[list[Circle | StarposError], Together]:
+    """Each pointing's circle, or the error, and their place; A3's axis where it is not known to a few arcmin.
 
     near: selects between two places that the elevations leave. self_calibrate: treat A3 as unknown.
     """
@@ -229,8 +211,8 @@ def from_elevations(
     circles = circles_of(solver, pointings, tilts)
     sound = [c for c in circles if isinstance(c, Circle)]
     if not sound:
-        return Elevations(tuple(circles), Together())
-    there, axis = None if near is None else (near.latitude, near.longitude), None
+        return circles, Together()
+    there, axis = None if near is None else near.place, None
     try:
         directions = Directions.of(sound)
         if self_calibrate or (directions.wide and len(directions.circles) >= MIN_WITHOUT_SITE):
@@ -245,19 +227,17 @@ def from_elevations(
             unnamed_inclinometer(solver.instrument),
             *doubts((), place, None, near),
         )
-        together = Together(place, "", tuple(filter(None, said)))
+        whole = Together(place, "", tuple(filter(None, said)), axis)
     except FixError as error:
-        together = Together(None, str(error))
-    found = Elevations(tuple(circles), together, axis)
-    if self_calibrate or axis is not None or not remarks.beyond_stated(together.average):
-        return found
+        whole = Together(None, str(error), axis=axis)
+    if self_calibrate or axis is not None or not remarks.beyond_stated(whole.average):
+        return circles, whole
     # residuals beyond the stated errors may come from a wrong A3, which no scatter covers
     given = solver.instrument.calibration
-    free = from_elevations(solver, pointings, tilts, near, self_calibrate=True)
+    _, free = from_elevations(solver, pointings, tilts, near, self_calibrate=True)
     if free.axis is None or free.axis.directions < MIN_JUDGED or free.axis.sigma_from(given) < DENIED_SIGMA:
-        return found
-    said = (remarks.of_denied_a3(free.axis, given), *free.together.remarks)
-    return replace(free, circles=tuple(circles), together=replace(free.together, remarks=said))
+        return circles, whole
+    return circles, replace(free, remarks=(remarks.of_denied_a3(free.axis, given), *free.remarks))
 
 
 def axis_of(

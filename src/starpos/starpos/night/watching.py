@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The poses of a camera that stands still, night by night: whether it has moved, and by how much."""
+"""A camera that stands still, night by night: whether it has moved, by how much, and how much the air dims its stars."""
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -10,15 +9,16 @@ import numpy as np
 
 from starpos import rotation
 from starpos.averaging.poses import mean_attitude
+from starpos.calibration.plumb_line import huber
 from starpos.errors import FixError
 from starpos.fix.attitude import Attitude
 from starpos.fix.heading import AttitudeAtPlace
-from starpos.fix.solution import Solution
+from starpos.fix.searching import Sight
 from starpos.fix.terms import total_covariance
 from starpos.frames.frame import Frame, Stars
+from starpos.frozen import at_once
 from starpos.instrument.camera import EQUIDISTANT, Camera
-from starpos.night.extinction import Light, extinction
-from starpos.units import ARCSEC, DAY_S, HOUR_S
+from starpos.units import ARCSEC, DAY_S, HOUR_S, SIGMA_PER_MAD
 
 # how far an untouched camera may wander from night to night, 1 sigma per axis: from the stiffest mount to a post in the
 # Sun.  Until the nights have shown it, each size up to USUAL_RAD is as probable as any other, and larger ones are so rare
@@ -34,6 +34,84 @@ LIMIT_PERCENTILE = 95
 MEAN_HOUR_DEG = 15.0
 # sources in the budget of a heading at a known place, `fix/heading.py`, that are new each night
 OF_THE_CLOCK = "clock", "time stamp"
+# stars that are brighter by this than the faintest identified ones are detected however their brightness errs
+SURELY_DETECTED_MAG = 1.0
+# the lowest altitude whose light is used, deg, and the fewest stars
+LOWEST_DEG, FEWEST_STARS = 5.0, 60
+# neighbours share what is not modelled of lens and sky: patches of 1 / PATCHES focal lengths count as one star each, and
+# this many are needed
+PATCHES, FEWEST_PATCHES = 4, 15
+# an error (mag per air mass) beyond which it is unknown; so it is where brightness does not follow light to this share
+UNKNOWN_MAG, LINEAR = 0.1, 0.2
+# share by which the air mass of low stars may differ from the law of any night
+LAW = 0.05
+ROUNDS = 10
+
+
+@at_once
+@dataclass(frozen=True)
+class Light:
+    """N identified stars: V by the catalogue, magnitude by the frame, air mass, places (N, 2) in focal lengths."""
+
+    v: np.ndarray
+    measured: np.ndarray
+    air_mass: np.ndarray
+    off: np.ndarray
+
+
+def air_mass(altitude_deg: np.ndarray) -> np.ndarray:
+    """Air masses at altitudes as they are seen, above 0 (Pickering 2002)."""
+    h = np.maximum(altitude_deg, 0.0)
+    return np.asarray(1 / np.sin(np.radians(h + 244 / (165 + 47 * h**1.1))))
+
+
+def light_of(sight: Sight, camera: Camera) -> Light:
+    """The sound identified stars of a frame whose attitude at a known place is known."""
+    stars, solution = sight.stars, sight.solution
+    assert solution.at_place is not None and solution.star is not None
+    row, v = np.asarray(solution.star, int), np.asarray(solution.magnitudes, float)
+    up = camera.directions(stars.x[row], stars.y[row]) @ solution.at_place.optics.rotation[2]
+    altitude = np.degrees(np.arcsin(np.clip(up, -1, 1)))
+    good = np.isfinite(v) & (stars.flags[row] == 0) & (stars.flux[row] > 0) & (altitude > LOWEST_DEG)
+    row, v, altitude = row[good], v[good], altitude[good]
+    off = np.stack([(stars.x[row] - camera.cx) / camera.fx, (stars.y[row] - camera.cy) / camera.fy], -1)
+    return Light(v, -2.5 * np.log10(stars.flux[row]), air_mass(altitude), off)
+
+
+def extinction(lights: Sequence[Light]) -> tuple[float, float]:
+    """Extinction in mag per air mass and its error, by frames of one camera and night; NaN where they do not show it.
+
+    The vignetting, a polynomial of the radius, is fitted too, and how much each frame is dimmed as a whole, as by dew.
+    """
+    v, measured, mass, off = (
+        np.concatenate([getattr(f, name) for f in lights]) for name in ("v", "measured", "air_mass", "off")
+    )
+    unknown = np.nan, np.nan
+    if len(v) < FEWEST_STARS:
+        return unknown
+    frame = np.repeat(range(len(lights)), [len(light.v) for light in lights])
+    bright = np.concatenate(
+        [light.v < np.percentile(light.v, 95) - SURELY_DETECTED_MAG for light in lights if len(light.v)]
+    )
+    patch = np.unique(np.floor(off[bright] * PATCHES), axis=0, return_inverse=True)[1].ravel()
+    if bright.sum() < FEWEST_STARS or patch.max() < FEWEST_PATCHES:
+        return unknown
+    r2 = np.square(off[bright]).sum(1)
+    zero = frame[bright, None] == np.unique(frame[bright])
+    design = np.column_stack([mass[bright], v[bright], r2, r2**2, zero])
+    target, weight = measured[bright], np.ones(len(r2))
+    for _ in range(ROUNDS):
+        found = np.linalg.lstsq(design * weight[:, None], target * weight, rcond=None)[0]
+        left = target - design @ found
+        weight = huber(left / max(SIGMA_PER_MAD * float(np.median(np.abs(left))), 1e-6))
+    inverse = np.linalg.pinv(design.T @ (design * weight[:, None] ** 2))
+    pulls = np.zeros((patch.max() + 1, design.shape[1]))
+    np.add.at(pulls, patch, design * (weight**2 * left)[:, None])
+    free = len(pulls) / max(len(pulls) - design.shape[1], 1)
+    sigma = np.sqrt(free * np.diag(inverse @ pulls.T @ pulls @ inverse))
+    if sigma[0] > UNKNOWN_MAG or abs(found[1] - 1) > LINEAR or found[0] < -2 * sigma[0]:
+        return unknown
+    return float(found[0]), float(np.hypot(sigma[0], LAW * found[0]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,18 +183,31 @@ class Answer:
     light: Light
     sky_mag: float = np.nan
 
+    @classmethod
+    def of(cls, item: Frame | Stars, sight: Sight, camera: Camera) -> "Answer":
+        """The part of a frame's sight, whose attitude is known."""
+        assert sight.solution.at_place is not None
+        return cls(
+            at_place=sight.solution.at_place,
+            stars=len(sight.solution.names),
+            focal_px=camera.fx,
+            light=light_of(sight, camera),
+            sky_mag=sky_mag(item, sight, camera),
+        )
 
-def sky_mag(frame: Frame, stars: Stars, answer: Solution, camera: Camera) -> float:
+
+def sky_mag(item: Frame | Stars, sight: Sight, camera: Camera) -> float:
     """V of the sky around the optical axis per square arcsec, by the identified stars of a fisheye's frame; else NaN.
 
     The pixels that the lens does not reach are the black level.  A picture of 8 bit has no level that is proportional to
     light.
     """
-    if camera.model != EQUIDISTANT or frame.pixels.dtype != np.uint16 or answer.star is None:
+    stars, answer = sight.stars, sight.solution
+    if isinstance(item, Stars) or camera.model != EQUIDISTANT or item.pixels.dtype != np.uint16:
         return np.nan
-    y, x = np.mgrid[0 : frame.height : SPARSE, 0 : frame.width : SPARSE]
+    y, x = np.mgrid[0 : item.height : SPARSE, 0 : item.width : SPARSE]
     off = np.hypot((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
-    levels = frame.pixels[::SPARSE, ::SPARSE].astype(float)
+    levels = item.pixels[::SPARSE, ::SPARSE].astype(float)
     dark, sky = levels[off > DARK_RAD], levels[off < SKY_RAD]
     row, v = np.asarray(answer.star, int), np.asarray(answer.magnitudes, float)
     good = np.isfinite(v) & (stars.flags[row] == 0)
@@ -189,6 +280,9 @@ def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
 
     The sizes of the wander from night to night are weighed by what the nights have shown of them so far.
     """
+    # slow to import, and of no use to what shares this module
+    from scipy.special import chdtrc
+
     log_weight = -RARER * np.log(np.maximum(WANDERS_RAD / USUAL_RAD, 1))
     found: list[Kept] = []
     first, nights, sums = np.eye(3), 0, (np.zeros((len(WANDERS_RAD), 3, 3)), np.zeros((len(WANDERS_RAD), 3)))
@@ -206,7 +300,7 @@ def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
             weight = np.exp(log_weight - log_weight.max())
             weight /= weight.sum()
             turned, covariance = weight @ off, np.tensordot(weight, total, 1)
-            alarm = bool(weight @ [_chance(x) for x in chi2] < ALARM_CHANCE)
+            alarm = bool(weight @ chdtrc(3, chi2) < ALARM_CHANCE)
             if not alarm:
                 log_weight -= (chi2 + np.linalg.slogdet(total)[1]) / 2
         found.append(
@@ -221,8 +315,3 @@ def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
         )
         nights += 1
     return tuple(found)
-
-
-def _chance(chi2: float) -> float:
-    """Probability that three normal numbers have a larger sum of squares."""
-    return math.erfc(math.sqrt(chi2 / 2)) + math.sqrt(2 * chi2 / math.pi) * math.exp(-chi2 / 2)

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starpos.earth.ellipsoid import EARTH_RADIUS_M
+from starpos.earth.ellipsoid import EARTH_RADIUS_M, enu_axes
 from starpos.report.style import BLUE, GREY, ORANGE
+from starpos.rotation import unit_vector
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -69,11 +70,8 @@ def _draw_disc(axes: "Axes", radius: float, size: float, graticule: np.ndarray, 
 
 def _seen_from(latitude: float, longitude: float, lines: np.ndarray) -> np.ndarray:
     """Orthographic projection (N, 2), in radii of the Earth, of longitudes and latitudes (N, 2) in deg; NaN behind it."""
-    turn, lat = np.radians(lines[:, 0]) - longitude, np.radians(lines[:, 1])
-    east = np.cos(lat) * np.sin(turn)
-    north = np.cos(latitude) * np.sin(lat) - np.sin(latitude) * np.cos(lat) * np.cos(turn)
-    up = np.sin(latitude) * np.sin(lat) + np.cos(latitude) * np.cos(lat) * np.cos(turn)
-    return np.where(up[:, None] >= 0, np.column_stack([east, north]), np.nan)
+    v = unit_vector(*np.radians(lines).T) @ enu_axes(latitude, longitude).T
+    return np.where(v[:, 2:] >= 0, v[:, :2], np.nan)
 
 
 def _graticule(step: int) -> np.ndarray:

@@ -2,7 +2,7 @@
 """What all pages of a report are made of: the document, figures, angles."""
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 
 import numpy as np
@@ -72,7 +72,7 @@ def sexagesimal(angle: float, sides: str) -> str:
     return f"{degrees}&deg; {minutes:02d}&prime; {seconds:02d}.{parts:02d}&Prime; {side}"
 
 
-def table(rows: Sequence[tuple[str, str]]) -> str:
+def table(rows: Iterable[tuple[str, str]]) -> str:
     """A table of names and texts, both in HTML."""
     cells = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>\n" for name, text in rows)
     return f"<table>\n{cells}</table>"

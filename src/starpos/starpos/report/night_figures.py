@@ -10,7 +10,7 @@ import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.place import Place
-from starpos.fix.fix import PlaceFix
+from starpos.fix.fix import PlaceFix, frame_to_icrs
 from starpos.fix.solution import FieldPointing
 from starpos.gnss.solving import Watched
 from starpos.gnss.watch import GnssStatus
@@ -153,16 +153,8 @@ def draw_budget(figure: "Figure", night: Night) -> None:
         low = max(min(highest) * 1e-3, min((v for row in values for v in row if v > 0), default=top) / 2)
         for j, ((label, _, colour), row) in enumerate(zip(places, values, strict=True)):
             at = np.arange(len(names)) + (len(places) / 2 - 0.5 - j) * height
-            axes.barh(at, np.maximum(np.nan_to_num(row), low), height, color=colour, label=label)
-            for y, value in zip(at, row, strict=True):
-                axes.text(
-                    max(np.nan_to_num(value), low) * 1.15,
-                    y,
-                    _short(value),
-                    va="center",
-                    fontsize=7,
-                    color="#333333",
-                )
+            bars = axes.barh(at, np.maximum(np.nan_to_num(row), low), height, color=colour, label=label)
+            axes.bar_label(bars, list(map(_short, row)), padding=2, fontsize=7, color="#333333")
         axes.set_xscale("log")
         axes.set_xlim(low, top * 12)
         axes.set_xlabel(title)
@@ -214,35 +206,34 @@ def draw_health(figure: "Figure", night: Night) -> None:
     shots = night.shots
     at, label = _times(shots)
     panels = figure.subplots(4, 1, sharex=True)
-    mark, size = ("o", 3.5) if len(shots) <= 150 else (".", 2.5)
+    mark, size = ("o", 3.5) if len(shots) <= MANY else (".", 2.5)
+
     points: dict[str, Any] = {"ms": size, "ls": "none", "marker": mark}
-    panels[0].plot(
-        at,
-        [s.stars_detected for s in shots],
-        color=ORANGE,
-        label="detected",
-        **points | {"ms": 1.8 * size, "mfc": "none"},
-    )
-    panels[0].plot(at, [s.stars_matched for s in shots], color=BLUE, label="in the fix", **points)
+
+    def draw(
+        axes: "Axes", values: Sequence[float] | np.ndarray, colour: str, label: str = "", **more: Any
+    ) -> None:
+        axes.plot(at, values, color=colour, label=label, **points | more)
+
+    draw(panels[0], [s.stars_detected for s in shots], ORANGE, "detected", ms=1.8 * size, mfc="none")
+    draw(panels[0], [s.stars_matched for s in shots], BLUE, "in the fix")
     panels[0].set_ylabel("stars")
     panels[0].set_ylim(0, 1.15 * max(1, *(s.stars_detected for s in shots)))
     _legend(panels[0])
     residual = np.array([s.residual_arcsec for s in shots])
-    panels[1].plot(at, residual, color=BLUE, **points)
+    draw(panels[1], residual, BLUE)
     panels[1].set_ylabel("residual,\narcsec")
     panels[1].set_ylim(0, 1.2 * np.nanmax(np.append(residual, 1e-3)))
     tilt = np.degrees([s.tilt for s in shots]) * 3600
     known = np.isfinite(tilt).all(1)
     mean = tilt[known].mean(0) if known.any() else np.zeros(2)
     for k, (axis, colour) in enumerate((("x", GREEN), ("y", PURPLE))):
-        panels[2].plot(
-            at, tilt[:, k] - mean[k], color=colour, label=f"{axis} about {mean[k] / 3600:+.4f}°", **points
-        )
+        draw(panels[2], tilt[:, k] - mean[k], colour, f"{axis} about {mean[k] / 3600:+.4f}°")
     panels[2].set_ylabel("tilt,\narcsec")
     _legend(panels[2])
     seconds = np.array([[s.identify_s, s.fix_s] for s in shots]) * 1e3
-    panels[3].plot(at, seconds[:, 0], color=ORANGE, label="identification", **points)
-    panels[3].plot(at, seconds[:, 1], color=BLUE, label="fix", **points)
+    draw(panels[3], seconds[:, 0], ORANGE, "identification")
+    draw(panels[3], seconds[:, 1], BLUE, "fix")
     panels[3].set_ylabel("time, ms")
     panels[3].set_ylim(0, 1.2 * np.nanmax(np.append(seconds, 1.0)))
     _legend(panels[3])
@@ -293,19 +284,18 @@ COLOURS = {
 }
 
 
-def compared_of(answers: Sequence[Watched]) -> list[Watched]:
-    """The answers to frames with a GNSS place, in the order of their times."""
-    timed = [a for a in answers if a.compared is not None and a.solution.utc_unix_s is not None]
-    return sorted(timed, key=lambda a: a.solution.utc_unix_s or 0.0)
+def timed_of(answers: Sequence[Watched]) -> list[Watched]:
+    """The answers to frames whose time is known, in its order."""
+    return sorted((a for a in answers if a.solution.utc_unix_s is not None), key=_time_of)
 
 
-def draw_drive(figure: "Figure", answers: Sequence[Watched]) -> None:
-    """Draw both places on a map, their distance over time, and what was learned over time."""
-    timed = sorted(
-        (a for a in answers if a.solution.utc_unix_s is not None), key=lambda a: a.solution.utc_unix_s or 0.0
-    )
-    begin_s = timed[0].solution.utc_unix_s or 0.0
-    hours = np.array([((a.solution.utc_unix_s or 0.0) - begin_s) / HOUR_S for a in timed])
+def _time_of(answer: Watched) -> float:
+    return answer.solution.utc_unix_s or 0.0
+
+
+def draw_drive(figure: "Figure", timed: Sequence[Watched]) -> None:
+    """Draw both places of `timed_of` answers on a map, their distance over time, and what was learned over time."""
+    hours = np.array([(_time_of(a) - _time_of(timed[0])) / HOUR_S for a in timed])
     above, middle, below = figure.subplots(3, 1, height_ratios=(2.2, 1.1, 1.1))
     _draw_map(above, timed)
     _draw_distance(middle, hours, timed)
@@ -316,9 +306,8 @@ def draw_drive(figure: "Figure", answers: Sequence[Watched]) -> None:
 
 def _draw_map(axes: "Axes", timed: Sequence[Watched]) -> None:
     plain(axes)
-    places = [a.compared.place for a in timed if a.compared is not None]
     grounds = [a.ground for a in timed if a.ground is not None]
-    first = places[0] if places else grounds[0]
+    first = next(a.compared.place for a in timed if a.compared is not None)
 
     def km(latitude: float, longitude: float) -> np.ndarray:
         here = Place.on_ellipsoid(*np.degrees([latitude, longitude]).tolist())
@@ -473,11 +462,8 @@ def polar(enu: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _axes(a: FieldPointing) -> np.ndarray:
     """Camera axes (3, 3) in ICRS: its rows are x (along columns), y (along rows) and z."""
-    ca, sa, cd, sd = np.cos(a.ra), np.sin(a.ra), np.cos(a.dec), np.sin(a.dec)
-    east, north = np.array([-sa, ca, 0.0]), np.array([-sd * ca, -sd * sa, cd])
-    cr, sr = np.cos(a.roll), np.sin(a.roll)
-    x = sr * north - cr * east
-    return np.stack([-x if a.mirrored else x, -(cr * north + sr * east), [cd * ca, cd * sa, sd]])
+    axes = frame_to_icrs(a.ra, a.dec, a.roll).T
+    return axes * [[-1], [1], [1]] if a.mirrored else axes
 
 
 def _outline(view: View) -> np.ndarray:

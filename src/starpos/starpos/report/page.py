@@ -63,38 +63,31 @@ def _picture(name: str, told: object, draw: "Callable[[Figure], None]", simulate
 def _figures(night: Night, catalogue: Catalogue) -> Iterator[_Figure]:
     draw = night_figures
     if night.fixed:
-        yield from _place_figures(night)
+        ground = (night.combined or night.places[0]).on_ground(night.vertical)
+        where = ground.latitude, ground.longitude, ground.covariance[:2, :2]
+        yield "map", "", lambda f: coast.draw_map(f, *where)
+        if night.steady is not None:
+            s = measures.steadiness(night, night.steady)
+            yield "stability", _outliers_told(s), lambda f: draw.draw_stability(f, s)
+        if len(night.fixed) > 1:
+            each = measures.stability(night)
+            yield "frames", _outliers_told(each), lambda f: draw.draw_stability(f, each)
+        yield "scatter", _scatter_told(night), lambda f: draw.draw_scatter(f, night)
+        if night.places[0].terms:
+            yield "budget", "", lambda f: draw.draw_budget(f, night)
         if (over := draw.overlaid(night)) is not None:
             yield _residuals(*over)
         if draw.views(night):
             yield "sky", draw.OUTLINES, lambda f: draw.draw_sky(f, night, catalogue)
-    if not night.shots:
-        return
-    if night.watched is not None and draw.compared_of(night.watched.answers):
-        answers = night.watched.answers
-        yield "drive", _alarm_told(answers), lambda f: draw.draw_drive(f, answers)
-    yield "health", "", lambda f: draw.draw_health(f, night)
+    timed = [] if night.watched is None else draw.timed_of(night.watched.answers)
+    if any(a.compared is not None for a in timed):
+        yield "drive", _alarm_told(timed), lambda f: draw.draw_drive(f, timed)
+    if night.shots:
+        yield "health", "", lambda f: draw.draw_health(f, night)
 
 
-def _place_figures(night: Night) -> Iterator[_Figure]:
-    draw = night_figures
-    ground = (night.combined or night.places[0]).on_ground(night.vertical)
-    where = ground.latitude, ground.longitude, ground.covariance[:2, :2]
-    yield "map", "", lambda f: coast.draw_map(f, *where)
-    if night.steady is not None:
-        s = measures.steadiness(night, night.steady)
-        yield "stability", _outliers_told(s), lambda f: draw.draw_stability(f, s)
-    if len(night.fixed) > 1:
-        each = measures.stability(night)
-        yield "frames", _outliers_told(each), lambda f: draw.draw_stability(f, each)
-    yield "scatter", _scatter_told(night), lambda f: draw.draw_scatter(f, night)
-    if night.places[0].terms:
-        yield "budget", "", lambda f: draw.draw_budget(f, night)
-
-
-def _alarm_told(answers: Sequence[Watched]) -> str:
-    compared = night_figures.compared_of(answers)
-    alarm = next((a for a in compared if a.compared and a.compared.status == GnssStatus.DISAGREES), None)
+def _alarm_told(timed: Sequence[Watched]) -> str:
+    alarm = next((a for a in timed if a.compared and a.compared.status == GnssStatus.DISAGREES), None)
     if alarm is None or alarm.compared is None:
         return "No alarm: GNSS never disagreed."
     return f"Alarm at {utc_text(alarm.solution.utc_unix_s or 0.0)}: {alarm.compared.sentence}."
@@ -159,7 +152,7 @@ def page(
     for number, (night, pictures) in enumerate(zip(nights, each, strict=True), 1):
         if len(nights) > 1:
             parts.append(f'<h2 id="night{number}">{number}. {escape(night.name)}</h2>')
-        parts += [_place(night), _simulated(night), _summary(night), figures(pictures)]
+        parts += [_place(night), _simulated(night), table(_rows(night)), _names(night), figures(pictures)]
     parts.append(
         f"<footer><p>{rows_of(TEXTS)['footer'].format(version=escape(__version__), made=escape(made_utc))}</p></footer>"
     )
@@ -202,81 +195,77 @@ def _degrees(angle: float) -> str:
     return f"{np.degrees(angle):+.6f}&deg;"
 
 
-def _summary(night: Night) -> str:
-    rows = []
+def _rows(night: Night) -> Iterator[tuple[str, str]]:
+    """Names and texts in HTML of what is known of a night."""
     if night.combined:
-        c = night.combined
-        ground = c.on_ground(night.vertical)
-        rows.append(("WGS 84", f"{sexagesimal(ground.latitude, 'NS')}, {sexagesimal(ground.longitude, 'EW')}, "
-                     f"{_errors(ground.covariance)}, the deflection of the vertical included"))  # fmt: skip
-        rows.append(
-            (
-                "By the plumb line (astronomic)",
-                f"{_degrees(c.latitude)}, {_degrees(c.longitude)} {_errors(c.covariance)}",
-            )
-        )
-        if np.isfinite(c.heading):
-            text = f"{np.degrees(c.heading):.4f} &plusmn; {np.degrees(c.sigma[2]):.4f}&deg; from astronomic north"
-            last = f", of the last of {_poses(c)} poses" if _poses(c) > 1 else ""
-            rows.append(
-                ("Heading", f"{text}, {np.degrees(ground.heading):.4f}&deg; from true north on WGS 84{last}")
-            )
-        else:
-            rows.append(("Heading", "none in common: the instrument turned between the frames"))
-    if night.truth and night.combined:
-        rows.append(("Error against the truth", _error(night.combined, night.truth)))
-    used = len(night.fixed)
-    failed = Counter(s.status.value for s in night.shots if s.place is None)
-    counts = f"{used} with a fix" + "".join(f", {n} {escape(why)}" for why, n in failed.most_common())
-    rows.append(("Frames", f"{len(night.shots)}: {counts}"))
-    whys: Counter[str] = Counter()
-    for s in night.shots:
-        whys[s.status.value] += s.place is None
-        if s.place is None and whys[s.status.value] <= REASONS:
-            rows.append((f"&lsquo;{escape(s.status.value)}&rsquo;", escape(s.message)))
+        yield from _rows_on_place(night.combined, night)
+    lost = [s for s in night.shots if s.place is None]
+    failed = Counter(s.status.value for s in lost)
+    counts = "".join(f", {n} {escape(why)}" for why, n in failed.most_common())
+    yield "Frames", f"{len(night.shots)}: {len(night.fixed)} with a fix{counts}"
+    told: Counter[str] = Counter()
+    for s in lost:
+        told[s.status.value] += 1
+        if told[s.status.value] <= REASONS:
+            yield f"&lsquo;{escape(s.status.value)}&rsquo;", escape(s.message)
     warned = Counter(warning for s in night.shots for warning in s.warnings)
     if warned:
-        rows.append(("Warnings", ", ".join(f"{n} {escape(what)}" for what, n in sorted(warned.items()))))
+        yield "Warnings", ", ".join(f"{n} {escape(what)}" for what, n in sorted(warned.items()))
     times = [s.utc_unix_s for s in night.shots if np.isfinite(s.utc_unix_s)]
     if times:
-        rows.append(("From, to", f"{escape(utc_text(min(times)))}, {escape(utc_text(max(times)))}"))
-    if used:
-        rows += _rows_on_fixes(night)
-    rows.append(("Source", escape(night.origin)))
-    rows += [("Note", escape(remark)) for remark in night.remarks]
-    return f"{table(rows)}\n{_names(night)}"
+        yield "From, to", f"{escape(utc_text(min(times)))}, {escape(utc_text(max(times)))}"
+    if night.fixed:
+        yield from _rows_on_fixes(night)
+    yield "Source", escape(night.origin)
+    for remark in night.remarks:
+        yield "Note", escape(remark)
 
 
-def _rows_on_fixes(night: Night) -> list[tuple[str, str]]:
+def _rows_on_place(c: PlaceFix, night: Night) -> Iterator[tuple[str, str]]:
+    ground = c.on_ground(night.vertical)
+    yield (
+        "WGS 84",
+        f"{sexagesimal(ground.latitude, 'NS')}, {sexagesimal(ground.longitude, 'EW')}, {_errors(ground.covariance)}, "
+        "the deflection of the vertical included",
+    )
+    where = f"{_degrees(c.latitude)}, {_degrees(c.longitude)} {_errors(c.covariance)}"
+    yield "By the plumb line (astronomic)", where
+    heading = "none in common: the instrument turned between the frames"
+    if np.isfinite(c.heading):
+        last = f", of the last of {_poses(c)} poses" if _poses(c) > 1 else ""
+        heading = (
+            f"{np.degrees(c.heading):.4f} &plusmn; {np.degrees(c.sigma[2]):.4f}&deg; from astronomic north, "
+            f"{np.degrees(ground.heading):.4f}&deg; from true north on WGS 84{last}"
+        )
+    yield "Heading", heading
+    if night.truth:
+        yield "Error against the truth", _error(c, night.truth)
+
+
+def _rows_on_fixes(night: Night) -> Iterator[tuple[str, str]]:
     shots = [s for _, s in night.fixed]
 
-    def median(values: Sequence[float]) -> float:
-        return float(np.median(values))
+    def median(name: str) -> float:
+        return float(np.median([getattr(s, name) for s in shots]))
 
-    detected, matched = (median([getattr(s, k) for s in shots]) for k in ("stars_detected", "stars_matched"))
-    identify, fix = (1e3 * median([getattr(s, k) for s in shots]) for k in ("identify_s", "fix_s"))
-    s = measures.stability(night)
-    rows = [
-        ("Stars, median", f"{detected:.0f} detected, {matched:.0f} in the fix"),
-        ("Residual, median", f"{figures_of(median([x.residual_arcsec for x in shots]))}&Prime;"),
-        ("Time, median", f"{figures_of(identify)} ms identification, {figures_of(fix)} ms fix"),
-    ]
+    yield (
+        "Stars, median",
+        f"{median('stars_detected'):.0f} detected, {median('stars_matched'):.0f} in the fix",
+    )
+    yield "Residual, median", f"{figures_of(median('residual_arcsec'))}&Prime;"
+    identify, fix = (figures_of(1e3 * median(name)) for name in ("identify_s", "fix_s"))
+    yield "Time, median", f"{identify} ms identification, {fix} ms fix"
     if len(shots) > 1:
-        lat, lon, _ = (figures_of(v) for v in s.mean_absolute)
-        rows.append(
-            (
-                "Mean absolute deviation",
-                f"latitude {lat}&Prime;, longitude {lon}&Prime;, each with its own tilt",
-            )
-        )
+        lat, lon, _ = (figures_of(v) for v in measures.stability(night).mean_absolute)
+        off = f"latitude {lat}&Prime;, longitude {lon}&Prime;, each with its own tilt"
+        yield "Mean absolute deviation", off
     if night.steady is not None:
         lat, lon, north = (figures_of(v) for v in measures.steadiness(night, night.steady).mean_absolute)
-        rows.append((
+        yield (
             "Stability",
             f"latitude {lat}&Prime;, longitude {lon}&Prime;, north {north}&Prime; with one tilt for all (the paper's "
             "0.526&Prime;, 1.70&Prime;, 6.34&Prime;)",
-        ))  # fmt: skip
-    return rows
+        )
 
 
 def _error(place: PlaceFix, truth: Truth) -> str:

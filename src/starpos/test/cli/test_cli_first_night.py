@@ -91,3 +91,10 @@ def test_a_level_that_repeats_one_value_gets_no_further(first_night, whole, tmp_
     (folder / "tilt.csv").write_text("\n".join([head, first, *rows]) + "\n")
     (status, said, _), out = first_night(folder)
     assert status == 1 and "does not measure" in said and not out.exists()
+
+
+def test_headings_that_hardly_determine_a3_write_no_file(first_night, whole, monkeypatch):
+    monkeypatch.setattr("starpos.night.first_night.worth_saving", lambda turned: False)
+    (status, said, complaint), out = first_night(whole[0])
+    assert status == 1 and "turn on, to other headings" in said and not out.exists()
+    assert "A3 is not known yet" in complaint[0]

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.night.extinction import Light, air_mass, extinction
+from starpos.night.watching import Light, air_mass, extinction
 
 EXTINCTION = 0.32
 

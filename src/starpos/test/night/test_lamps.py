@@ -22,6 +22,7 @@ from starpos.night.reading import Instruments
 from starpos.night.solving import answers_of
 from starpos.night.together import FrameAnswer
 from starpos.night.work import Solving
+from starpos.rotation import from_vector
 from starpos.sky.bodies import body_at
 from starpos.sky.catalogue import load_catalogue
 from starpos.units import unix_of
@@ -86,3 +87,16 @@ def test_a_glow_that_nothing_proves_has_no_heading():
     told = list(answers_of(sights, Solving(Instruments(INSTRUMENT), atmosphere=AIR), Deflection()).each)
     assert [a.solution.ok for a in told] == [False, False]
     assert all("some minutes later" in a.solution.message for a in told)
+
+
+def test_a_lamp_that_shifts_a_little_does_not_become_the_sun():
+    """Its last glow has neither kept its place nor moved as the Sun."""
+    rows = answers([0, 30, 500, 600], lamp=True)
+    stars, last = rows[-1]
+    shifted = replace(last.glow, ray=from_vector([0.012, 0.0, 0.0]) @ last.glow.ray)
+    rows[-1] = stars, replace(last, glow=shifted)
+    assert rows[0][1].glow.stood_still(shifted) is None
+    sights = [(f"{k}", Sight(stars, s)) for k, (stars, s) in enumerate(rows)]
+    told = list(answers_of(sights, Solving(Instruments(INSTRUMENT), atmosphere=AIR), Deflection()).each)
+    assert [a.solution.ok for a in told] == [False] * 4
+    assert "some minutes later" in told[-1].solution.message

@@ -19,6 +19,7 @@ from starpos.gnss.receiver import GnssTrack
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, TiltsByTime
 from starpos.night.reading import Instruments
+from starpos.night.remarks import worth_saving
 from starpos.night.solving import ONE_BY_ONE, Exposures, How, answers_of, solved_night
 from starpos.night.together import Gathered, together, turned
 from starpos.night.work import Solving
@@ -149,8 +150,8 @@ def test_frames_solved_together_are_only_identified_before(how, still):
 
 def test_turning_finds_a3_and_says_what_it_rests_on(turning):
     answers = turning.answers(How(180.0))
-    assert answers.given is None and answers.turned.calibrated is not None
-    assert answers.instrument is answers.turned.calibrated.instrument
+    assert answers.given is None and answers.turned.fixes
+    assert answers.instrument is answers.turned.instrument
     gathered = Gathered()
     for answer in answers.each:
         gathered.gather(answer)
@@ -199,8 +200,8 @@ class _Standing:
 def test_turning_with_nothing_identified_keeps_each_sentence(still, points):
     lost = Solving(Instruments(still.instrument))(points)
     solver = Solver(still.instrument, still.work.solver(points).catalogue)
-    found = turned(solver, [lost, lost], still.work.tilts, 180.0)
-    assert found.solutions == (lost.solution, lost.solution) and not found.worth_saving
+    found, _ = turned(solver, [lost, lost], still.work.tilts, 180.0)
+    assert found.solutions == (lost.solution, lost.solution) and not worth_saving(found)
 
 
 def test_the_remark_of_a_wrong_header_outlives_the_turn(turning):
@@ -266,7 +267,7 @@ def test_an_unknown_a3_is_no_calibration_worth_saving(still):
     unknown = Instrument(FOCAL_PX)
     solver = Solver(unknown, still.work.solver(still.stars[0]).catalogue, AIR)
     sights = [searching.answer_frame(solver, searching.Question(item=s, stars=s)) for s in still.stars]
-    assert not turned(solver, sights, still.work.tilts, 180.0).worth_saving
+    assert not worth_saving(turned(solver, sights, still.work.tilts, 180.0)[0])
 
 
 def test_a_worker_is_not_sent_the_solver_and_its_catalogue(catalogue, rng):

@@ -9,6 +9,7 @@ import pytest
 from starpos import rotation
 from starpos.cli import watch_output
 from starpos.fix.attitude import Attitude
+from starpos.fix.searching import Sight
 from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import EQUIDISTANT, Camera
@@ -101,7 +102,7 @@ def test_the_brightness_of_the_sky_by_its_stars(rng):
         flags=np.zeros(40, np.uint8),
     )
     solution = SimpleNamespace(star=np.arange(40), magnitudes=v)
-    assert sky_mag(Frame(pixels), stars, solution, camera) == pytest.approx(21.0, abs=0.02)
+    assert sky_mag(Frame(pixels), Sight(stars, solution), camera) == pytest.approx(21.0, abs=0.02)
     # levels that are no light, and a frame without a corner that is dark
-    assert np.isnan(sky_mag(Frame(pixels.astype(np.uint8)), stars, solution, camera))
-    assert np.isnan(sky_mag(Frame(pixels), stars, solution, camera.scaled(5)))
+    assert np.isnan(sky_mag(Frame(pixels.astype(np.uint8)), Sight(stars, solution), camera))
+    assert np.isnan(sky_mag(Frame(pixels), Sight(stars, solution), camera.scaled(5)))
