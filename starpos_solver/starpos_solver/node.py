@@ -10,7 +10,6 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_srvs.srv import Trigger
 
@@ -32,7 +31,8 @@ from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, declared, now_of
 from starpos_solver.publishing import SolutionPublishers, StaticTransforms
 
 POLL_S = 0.02
-TILT_QUEUE, STARS_QUEUE = 1000, 100
+# messages that may wait for the executor
+QUEUES = {"tilt": 1000, "stars": 100}
 PLAY_SLOWER = (
     "play it slower, or by `ros2 run starpos_bringup replay`; frames without them have other fixes, or none"
 )
@@ -60,8 +60,7 @@ class SolverNode(Node):
             lambda: JobRunner(self, self._go_on),
             self._inputs,
             NodeLog(self.get_logger()),
-            arrived=lambda: self._arrived(self._tilts, "tilt", TILT_QUEUE),
-            arrived_stars=lambda: self._arrived(self._stars, "stars", STARS_QUEUE),
+            arrived=self._arrived,
             topic=self.resolve_topic_name(CAMERA_TOPIC),
         )
         self._connect()
@@ -76,8 +75,10 @@ class SolverNode(Node):
         self._transforms = StaticTransforms(self)
         session = self._session
         subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._taker(CAMERA_TOPIC), 10)
-        self._tilts = subscription(self, msg.Tilt, "tilt", self._taker("tilt"), TILT_QUEUE)
-        self._stars = subscription(self, msg.StarArray, "stars", self._taker("stars"), STARS_QUEUE)
+        self._ears = {
+            name: subscription(self, kind, name, self._taker(name), QUEUES[name])
+            for name, kind in (("tilt", msg.Tilt), ("stars", msg.StarArray))
+        }
         if session.satellites is not None:
             subscription(self, msg.TrailArray, "trails", self._taker("trails"), 10)
         self._again = self.create_guard_condition(self._go_on)
@@ -146,13 +147,11 @@ class SolverNode(Node):
         if time_is_simulated(self):
             self._dropped.came(name, info)
 
-    def _arrived(self, ear: Subscription, name: str, most: int) -> Iterator[tuple[Any, Sent]]:
-        """Read what has arrived but waits for the executor.
-
-        name: relative one of the topic.  most: messages that may wait.
-        """
+    def _arrived(self, name: str) -> Iterator[tuple[Any, Sent]]:
+        """Read what has arrived of a topic, by its relative name, but waits for the executor."""
+        ear = self._ears[name]
         with ear.handle:
-            for _ in range(most):
+            for _ in range(QUEUES[name]):
                 taken = ear.handle.take_message(ear.msg_type, False)
                 if taken is None:
                     return

@@ -17,7 +17,7 @@ from std_msgs.msg import Header
 
 from starpos.earth.vertical import Geodetic
 from starpos.instrument.instrument import Instrument
-from starpos.session.driver import Answered, Averaged, BySatellites, Output
+from starpos.session.driver import Answered, BySatellites, Output
 from starpos.session.settings import Settings
 from starpos_common.messages import attitude_to_message, quaternion
 from starpos_common.topics import publisher
@@ -148,9 +148,6 @@ class SolutionPublishers:
 
     def publish(self, output: Output) -> None:
         header = self._header(output.stamp)
-        if isinstance(output, Averaged):
-            self._fix_averaged.publish(self._nav_sat_fix(header, output.ground))
-            return
         if isinstance(output, BySatellites):
             if self._by_satellites is not None:
                 self._by_satellites.publish(outputs.fix_by_satellites(header, output.fix))
@@ -166,6 +163,9 @@ class SolutionPublishers:
         if output.attitude is not None:
             self._attitude.publish(attitude_to_message(output.attitude))
         self._solution.publish(self.solution(output))
+        if output.average is not None:
+            ground = output.average.on_ground(self._settings.vertical)
+            self._fix_averaged.publish(self._nav_sat_fix(header, ground))
 
     def solution(self, answered: Answered) -> msg.Solution:
         message = outputs.solution(self._header(answered.stamp), answered.solution, answered.ground)

@@ -75,6 +75,7 @@ class Answered:
     no_camera: no camera calibration has arrived.
     attitude: the camera's, by its stars; None if they do not determine it.
     compared: the GNSS place at the frame, and what the guard says of it; None without one.
+    average: of the fixes here, after this one was added to it; None where it does not include this one.
     """
 
     stamp: Any
@@ -83,15 +84,7 @@ class Answered:
     no_camera: bool
     attitude: "CameraAttitude | None" = None
     compared: "GnssCheck | None" = None
-
-
-@dataclass(frozen=True)
-class Averaged:
-    """The average after a frame was added to it, with the stamp of that frame's message."""
-
-    stamp: Any
-    place: "Average"
-    ground: "Geodetic"
+    average: "Average | None" = None
 
 
 @dataclass(frozen=True)
@@ -102,7 +95,7 @@ class BySatellites:
     fix: "SatelliteFix | None"
 
 
-Output = Answered | Averaged | BySatellites
+Output = Answered | BySatellites
 
 
 class Log(Protocol):

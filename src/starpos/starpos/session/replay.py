@@ -27,7 +27,7 @@ from starpos.night.reading import stars_of
 from starpos.recording import topics
 from starpos.recording.bag import BagReader
 from starpos.recording.drivers import IMAGES, DriverMessages, Drivers
-from starpos.session.driver import Answered, Averaged, Heard, JobsInTurn, Log, Now, Output
+from starpos.session.driver import Answered, Heard, JobsInTurn, Log, Now, Output
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings
 
@@ -227,8 +227,7 @@ class Playing:
                 if isinstance(output, Answered):
                     # without what only its solver needs
                     night.solutions.append(replace(output.solution, hint=None))
-                elif isinstance(output, Averaged):
-                    night.average = output.place
+                    night.average = output.average or night.average
                 else:
                     night.by_satellites = output.fix or night.by_satellites
         except StarposError as error:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from starpos.averaging.average import Average
 from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError
 from starpos.fix.attitude import CameraAttitude
@@ -33,7 +34,7 @@ from starpos.session import reports
 from starpos.session.calibrating import OF_AVERAGE, OF_MOUNTING, Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.deflection import LiveDeflection
-from starpos.session.driver import Answered, Averaged, Changes, Heard, Jobs, Log, Now, Output, Sent, refusing
+from starpos.session.driver import Answered, Changes, Heard, Jobs, Log, Now, Output, Sent, refusing
 from starpos.session.gnss import GnssTeacher, SessionPlaces
 from starpos.session.gyro import Gyro
 from starpos.session.pace import MAX_WAITING, Backlog, Pace, Waiting
@@ -62,7 +63,7 @@ class SolverSession:
     """An instrument's messages to its solutions.
 
     jobs: makes the runner of long jobs; when an Outcome has come, call `at`.
-    arrived, arrived_stars: give the tilts, and the star lists, that have come but are not taken yet.
+    arrived: gives the messages of `tilt`, or of `stars`, that have come but are not taken yet.
     topic: full name of the topic of the camera's intrinsics, for sentences.
     """
 
@@ -73,8 +74,7 @@ class SolverSession:
         heard: Heard,
         log: Log,
         *,
-        arrived: Callable[[], Iterable[tuple[Any, Sent]]] = tuple,
-        arrived_stars: Callable[[], Iterable[tuple[Any, Sent]]] = tuple,
+        arrived: Callable[[str], Iterable[tuple[Any, Sent]]] = lambda name: (),
         topic: str = CAMERA_TOPIC,
     ) -> None:
         # the runners whose outcomes answers depend on
@@ -120,7 +120,7 @@ class SolverSession:
         # This reads the tables of the Earth's rotation, so that the first frame is not slow.
         earth_state(J2000_UNIX_S)
         self._heard, self._log = heard, log
-        self._arrived, self._arrived_stars = arrived, arrived_stars
+        self._arrived = arrived
         self._backlog = Backlog()
         self._was_s: float | None = None
         self._ended = False
@@ -222,7 +222,7 @@ class SolverSession:
     def _take_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
         """Take a StarArray, and those that have come after it."""
         made = self._add_stars(message, now, sent)
-        for later, later_sent in self._arrived_stars():
+        for later, later_sent in self._arrived("stars"):
             made += self._add_stars(later, now, later_sent)
         return made
 
@@ -327,9 +327,9 @@ class SolverSession:
                 self.more = True
                 return made
             # After a stall the frame's own tilts may be among them.
-            for message, sent in self._arrived():
+            for message, sent in self._arrived("tilt"):
                 self._take_tilt(message, now, sent)
-            made += self._solve(self._backlog.take(now.waiting_s).dated(now), now)
+            made.append(self._solve(self._backlog.take(now.waiting_s).dated(now), now))
         self._backlog.pause()
         return made
 
@@ -354,7 +354,7 @@ class SolverSession:
             return True
         return self.tilts.complete(mid, frame.stars.exposure_s or 0.0)
 
-    def _solve(self, frame: Waiting, now: Now) -> list[Output]:
+    def _solve(self, frame: Waiting, now: Now) -> Answered:
         predicted: Priors = self._guarded(
             lambda: self.gyro.predicted(frame.stars, self.instrument.solver), lambda e: ()
         )
@@ -377,10 +377,8 @@ class SolverSession:
             self._guarded(
                 lambda: satellites.note(frame.header.stamp, frame.stars, answered.solution), lambda e: None
             )
-        return [
-            replace(answered, attitude=self._attitude(frame, question, answered.solution)),
-            *self._learn(frame, answered.solution),
-        ]
+        attitude = self._attitude(frame, question, answered.solution)
+        return replace(answered, attitude=attitude, average=self._learn(frame, answered.solution))
 
     def _guarded(self, work: Callable[[], T], instead: Callable[[Exception], T]) -> T:
         """What `work` makes.  A defect in it is logged and loses only that: the session goes on with `instead`."""
@@ -449,30 +447,27 @@ class SolverSession:
             lambda e: None,
         )
 
-    def _learn(self, frame: Waiting, answer: Solution) -> list[Output]:
+    def _learn(self, frame: Waiting, answer: Solution) -> Average | None:
         """Give a frame to the calibration and the average, even one that a stale calibration refuses.
 
         A frame whose time is in doubt is left out.  Returns the average if it includes the frame.
         """
         stars, solver = frame.stars, self.instrument.solver
         if solver is None or stars.mid_unix_s is None or frame.doubted:
-            return []
+            return None
         if answer.status is Status.BAD_INPUT and frame.ahead_s > reports.AHEAD_S:
-            return []
+            return None
         try:
             tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
             solver.instrument.inclinometer.check_live(tilt)
         except StarposError:
-            return []
+            return None
         self._guarded(lambda: self.deflection.include(solver, stars, tilt, answer.found), lambda e: None)
-        place = self._guarded(
+        return self._guarded(
             lambda: self.calibrating.include(Seen(stars, tilt, answer.found), answer.fix),
             # data that cause a defect must not stay
             lambda e: self.calibrating.forget(),
         )
-        if place is None:
-            return []
-        return [Averaged(frame.header.stamp, place, place.on_ground(self._settings.vertical))]
 
     def _note(self, answer: Solution, now: Now) -> None:
         """Note the answer to the newest frame."""

@@ -255,7 +255,7 @@ def test_a_replay_twice_is_the_same():
         ]
 
     first = played()
-    assert first == played() and len(first) == 20
+    assert first == played() and len(first) == 10
 
 
 def test_tilts_stamped_before_their_time_are_refused_though_they_are_read_when_it_has_come(messages):
