@@ -17,12 +17,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 
-from starpos.recording.topics import IMAGE, IMU, PICTURE, SOLUTION, STARS
+from starpos.recording.topics import FRAMES, IMAGES, IMU, SOLUTION, STARS
 from starpos_bringup.bag import Topic
 from starpos_interfaces.msg import Solution, StarArray
 
-IMAGES = (IMAGE, PICTURE)
-FRAMES = (STARS, *IMAGES)
 CLOCK_PERIOD_S = 0.025
 ACKNOWLEDGED_S = 3.0
 # How far the bag's time goes on beyond a frame that is not answered: solver and detector wait for later messages.

@@ -25,15 +25,13 @@ from starpos.night.solving import Exposures, Worked
 from starpos.night.work import Solving
 from starpos.progress import Progress
 from starpos.recording.bag import BagReader
-from starpos.recording.drivers import IMAGES, DriverMessages, Drivers
-from starpos.recording.topics import CAMERA_INFO, CAPTURE, IMU, INPUTS, STARS, TILT, instrument_in
+from starpos.recording.drivers import DriverMessages, Drivers
+from starpos.recording.topics import CAMERA_INFO, CAPTURE, FRAMES, IMU, INPUTS, STARS, TILT, instrument_in
 from starpos.units import utc_text
 
 SUFFIXES = (".mcap", ".db3")
 # of ROS 1, which is refused with a sentence
 ROS1_SUFFIX = ".bag"
-# types of messages that are a frame each
-WITH_STARS = (STARS, *IMAGES)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,7 +77,7 @@ def read(
     unusable = 0
     with BagReader(path, typed=True) as bag:
         chosen = instrument_in(bag, namespace, INPUTS, drivers.remaps)
-        wanted = [c for c in chosen.connections if c.msgtype not in WITH_STARS]
+        wanted = [c for c in chosen.connections if c.msgtype not in FRAMES]
         total = sum(c.msgcount for c in wanted) or 1
         for done, (connection, log_ns, message) in enumerate(bag.decoded(wanted), 1):
             if done % 500 == 0 or done == total:
@@ -115,7 +113,7 @@ def read(
             drivers=drivers,
             cameras=cameras,
             tilts=TiltLog.of_readings(tilts) if tilts else None,
-            star_count=sum(c.msgcount for c in chosen.connections if c.msgtype in WITH_STARS),
+            star_count=sum(c.msgcount for c in chosen.connections if c.msgtype in FRAMES),
             truth=truth_in(path) if path.is_dir() else None,
             remarks=tuple(filter(None, remarks)),
         )
@@ -126,7 +124,7 @@ def each_frame(r: Recorded) -> Iterator[tuple[str, Stars | FrameError]]:
     messages = DriverMessages(r.drivers)
     with BagReader(r.path, typed=True) as bag:
         chosen = instrument_in(bag, r.namespace, INPUTS, r.drivers.remaps)
-        wanted = [c for c in chosen.connections if c.msgtype in (*WITH_STARS, CAPTURE)]
+        wanted = [c for c in chosen.connections if c.msgtype in (*FRAMES, CAPTURE)]
         for connection, _, message in bag.decoded(wanted):
             if connection.msgtype == CAPTURE:
                 messages.receive_capture(message)

@@ -81,7 +81,7 @@ APART = "all frames with stars are stamped later than the IMU's readings: set th
 class Navigated:
     """An output at one time: a fix, the place on the ellipsoid, where it lies from the origin; None without support.
 
-    displacement (3,): m east, north, up of the first place that was known to WIDE_M, along the axes there; with its
+    displacement (3,): m east, north, up of the first place that was known to WIDE_M, along the axes there; and its
     covariance (3, 3).
     at_place: heading, pitch and roll at a known place, while there is no fix; None where no place is known.
     """
@@ -89,8 +89,7 @@ class Navigated:
     utc_unix_s: float
     fix: VoyageFix | None = None
     ground: Geodetic | None = None
-    displacement: np.ndarray | None = None
-    displacement_covariance: np.ndarray | None = None
+    displacement: tuple[np.ndarray, np.ndarray] | None = None
     at_place: Attitude | None = None
 
 
@@ -124,11 +123,6 @@ class NavigatorSession:
         self._clock_stddev_s = 0.0
         self._gnss = ComparedPlaces()
         self._jobs.disown()
-
-    @property
-    def busy(self) -> bool:
-        """Whether an adjustment runs."""
-        return self._jobs.busy
 
     def parameters_set(self) -> None:
         """Adjust anew with other parameters as soon as may be."""
@@ -269,7 +263,8 @@ class NavigatorSession:
         found: Voyage = made.value
         self._faults, self._sun = found.faults, sun
         self._seen_s = found.last.utc_unix_s
-        self._known = observability(found.last, self._is_measured)
+        is_measured = bool(self._recent.velocities) or self._values["vehicle"] == PARKED
+        self._known = observability(found.last, is_measured)
         self._estimate = self._carried_on(found.last)
         self._changes.say("fixes are coming" if sun is None else "headings by the Sun are coming", good=True)
 
@@ -279,10 +274,6 @@ class NavigatorSession:
         if readings.closed_s <= estimate.utc_unix_s:
             return estimate
         return estimate.carried_on(readings.since(estimate.utc_unix_s), readings.closed_s)
-
-    @property
-    def _is_measured(self) -> bool:
-        return bool(self._recent.velocities) or self._values["vehicle"] == PARKED
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
@@ -297,25 +288,20 @@ class NavigatorSession:
         if self._sun is not None:
             return Navigated(utc_unix_s=time_s, at_place=self._sun.heading_by(estimate.fix.link))
         self.counts["fixes"] += 1
-        ground, (displacement, covariance) = (
-            estimate.fix.on_ground(self._settings.vertical),
-            self._displacement(estimate),
-        )
         return Navigated(
             utc_unix_s=time_s,
             fix=estimate.fix,
-            ground=ground,
-            displacement=displacement,
-            displacement_covariance=covariance,
+            ground=estimate.fix.on_ground(self._settings.vertical),
+            displacement=self._displacement(estimate),
         )
 
-    def _displacement(self, estimate: Estimate) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
+    def _displacement(self, estimate: Estimate) -> tuple[np.ndarray, np.ndarray] | None:
         """Where an estimate lies from the first place that was known well enough, with covariance; None before it."""
         place = estimate.motion.place[0]
         if self._origin is None and self._known is not None and self._known.sigma_m < WIDE_M:
             self._origin = place
         if self._origin is None:
-            return None, None
+            return None
         latitude, longitude, _ = (float(x) for x in geodetic_place(self._origin))
         axes = enu_axes(latitude, longitude)
         return axes @ (place - self._origin), axes @ estimate.covariance[PLACE, PLACE] @ axes.T

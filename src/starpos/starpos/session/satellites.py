@@ -13,6 +13,7 @@ from starpos.errors import SatelliteError, StarposError
 from starpos.fix.solution import Solution
 from starpos.frames.frame import FrameTrail, Stars
 from starpos.gnss.receiver import gnss_place
+from starpos.messages.stamp import stamp_to_ns
 from starpos.messages.stars import message_to_trails
 from starpos.satellites.adjustment import KnownBefore
 from starpos.satellites.elements import StoredOrbits, chosen
@@ -35,7 +36,6 @@ Frame = tuple[Any, Stars, Solution, list[FrameTrail]]
 class Located:
     """Result of a job: the trails that count, the place or why it is missing, and a sentence on what is left out."""
 
-    stamp: Any
     trails: tuple[SatelliteTrail, ...]
     fix: SatelliteFix | None = None
     why: str = ""
@@ -55,7 +55,6 @@ class LiveSatellites:
         self._identified: dict[int, tuple[Stars, Solution]] = {}
         self._found: dict[int, tuple[Any, list[FrameTrail]]] = {}
         self._waiting: list[Frame] = []
-        self._trails: tuple[SatelliteTrail, ...] = ()
         self._newest: Located | None = None
         self._made: list[Output] = []
         self._place: Place | None = None
@@ -66,16 +65,16 @@ class LiveSatellites:
 
     def receive(self, message: Any) -> None:
         with refusing(self._heard, "trails"):
-            stamp = message.header.stamp
-            self._found[_ns(stamp)] = stamp, message_to_trails(message)
-            self._pair(_ns(stamp))
+            stamp, ns = message.header.stamp, stamp_to_ns(message.header.stamp)
+            self._found[ns] = stamp, message_to_trails(message)
+            self._pair(ns)
 
     def note(self, stamp: Any, stars: Stars, answer: Solution) -> None:
         """Take the stars of a frame, if they are identified."""
         if answer.found is not None and answer.pointing is not None:
             shutter = self._settings.instrument(None).shutter or stars.shutter
-            self._identified[_ns(stamp)] = replace(stars, shutter=shutter), answer
-            self._pair(_ns(stamp))
+            self._identified[stamp_to_ns(stamp)] = replace(stars, shutter=shutter), answer
+            self._pair(stamp_to_ns(stamp))
 
     def _pair(self, ns: int) -> None:
         if ns in self._identified and ns in self._found:
@@ -93,7 +92,8 @@ class LiveSatellites:
         return made
 
     def _begin(self) -> None:
-        frames, trails, values = tuple(self._waiting), self._trails, self._settings.values
+        frames, values = tuple(self._waiting), self._settings.values
+        trails = () if self._newest is None else self._newest.trails
         self._waiting.clear()
         instrument = self._settings.instrument(None)
         # an error of the stamps may be the same in all frames
@@ -106,15 +106,14 @@ class LiveSatellites:
         self._jobs.run(
             lambda: located(frames, trails, self._orbits, self._catalogue, prior, window_s),
             # a defect loses these frames' trails
-            lambda o: self._take(o.value or Located(stamp=frames[-1][0], trails=trails, why=o.trouble)),
+            lambda o: self._take(frames[-1][0], o.value or Located(trails=trails, why=o.trouble)),
         )
 
-    def _take(self, found: Located) -> None:
-        self._newest, self._trails = found, found.trails
-        self._made.append(BySatellites(found.stamp, found.fix))
-        if found.fix is not None:
+    def _take(self, stamp: Any, found: Located) -> None:
+        self._newest = found
+        self._made.append(BySatellites(stamp, found.fix))
+        if (fix := found.fix) is not None:
             utc_unix_s = float(found.trails[-1].utc_unix_s[0])
-            fix = found.fix
             self._place = gnss_place(utc_unix_s, fix.latitude, fix.longitude, fix.covariance[:2, :2])
 
     # what it is good for ----------------------------------------------------------------------------------------------
@@ -185,10 +184,9 @@ def located(
         else:
             trails += seen.trails
             left_out = seen.left_out or left_out
-    stamp = frames[-1][0]
     begin = max((float(t.utc_unix_s[0]) for t in trails), default=0.0) - window_s
     kept = tuple(replace(t, track=k) for k, t in enumerate(t for t in trails if t.utc_unix_s[0] >= begin))
-    made = Located(stamp=stamp, trails=kept, left_out=left_out)
+    made = Located(trails=kept, left_out=left_out)
     if not kept:
         return replace(made, why="no trail shows an end of its exposure")
     try:
@@ -196,7 +194,3 @@ def located(
         return replace(made, fix=locate(kept, usable, prior))
     except SatelliteError as error:
         return replace(made, why=str(error))
-
-
-def _ns(stamp: Any) -> int:
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)

@@ -233,10 +233,9 @@ class SolverSession:
         try:
             stars = message_to_stars(message)
         except StarposError as e:
-            number = len(message.stars)
-            bad = Solution(Status.BAD_INPUT, str(e), source="stars", utc_unix_s=None, stars_detected=number)
+            bad = replace(Solution.unreadable("stars", e), stars_detected=len(message.stars))
             self._note(bad, now)
-            return [self._output(message.header.stamp, bad)]
+            return [self._output(message.header.stamp, Watched(solution=bad))]
         self._wait_for(stars, message.header, now)
         return []
 
@@ -428,15 +427,14 @@ class SolverSession:
 
     def _taught(self, frame: Waiting, answer: Solution, compared: bool) -> Answered:
         """The answer to a frame, with gnss.use by what GNSS has taught; compared: with GNSS's place of its time too."""
-        stamp, solver, gnss = frame.header.stamp, self.instrument.solver, self.gnss
-        if gnss is None or solver is None or frame.refused is not None:
-            return self._output(stamp, answer)
-        taught = self._guarded(
-            lambda: gnss.solve(solver, frame.stars, answer, compared),
-            lambda e: Watched(solution=_failed(frame, "what GNSS taught could not be used on this frame", e)),
-        )
-        made = self._output(stamp, taught.solution)
-        return replace(made, ground=taught.ground, compared=taught.compared)
+        solver, gnss, taught = self.instrument.solver, self.gnss, Watched(solution=answer)
+        if gnss is not None and solver is not None and frame.refused is None:
+            why = "what GNSS taught could not be used on this frame"
+            taught = self._guarded(
+                lambda: gnss.solve(solver, frame.stars, answer, compared),
+                lambda e: Watched(solution=_failed(frame, why, e)),
+            )
+        return self._output(frame.header.stamp, taught)
 
     def _attitude(self, frame: Waiting, question: Question, answer: Solution) -> CameraAttitude | None:
         if (solver := self.instrument.solver) is None:
@@ -478,10 +476,14 @@ class SolverSession:
         if self.gnss is not None:
             self.gnss.save_if_due(now)
 
-    def _output(self, stamp: Any, answer: Solution) -> Answered:
+    def _output(self, stamp: Any, made: Watched) -> Answered:
         no_camera = self.instrument.solver is None and self.instrument.camera is None
-        ground = None if answer.fix is None else answer.fix.on_ground(self._settings.vertical)
-        return Answered(stamp=stamp, solution=answer, ground=ground, no_camera=no_camera)
+        solution, ground = made.solution, made.ground
+        if ground is None and solution.fix is not None:
+            ground = solution.fix.on_ground(self._settings.vertical)
+        return Answered(
+            stamp=stamp, solution=solution, ground=ground, no_camera=no_camera, compared=made.compared
+        )
 
     def solve_again(self) -> Answered | None:
         """Solve the newest frame with what is known now, identified anew whatever was found before; None without one.
