@@ -3,12 +3,10 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
 
-from starpos.instrument.camera import Camera
 from starpos.parameters.table import parameters_of
 from starpos.session.driver import Now
 from starpos.session.settings import NodeSettings
@@ -83,24 +81,15 @@ def now_of(node: Node) -> Now:
     return Now.in_data(unix_s) if time_is_simulated(node) else Now(unix_s, time.monotonic())
 
 
-def declared(
-    node: Node,
-    name: str,
-    settings: NodeSettings,
-    apply: Callable[[frozenset[str]], None],
-    camera: Callable[[], Camera | None] = lambda: None,
-) -> None:
+def declared(node: Node, name: str, settings: NodeSettings, apply: Callable[[frozenset[str]], None]) -> None:
     """Declare the parameters of the node of that name for its settings, which may be set while it runs.
 
-    apply: called with the names that were set.  camera: returns the camera in use, None before there is one.
+    apply: called with the names that were set.
     """
 
     def adopted(names: frozenset[str]) -> None:
         settings.adopt()
         apply(names)
 
-    def check(values: Mapping[str, Any], names: frozenset[str]) -> str | None:
-        return settings.check(values, names, camera())
-
-    settings.values = declare(node, parameters_of(name), apply=adopted, check=check)
+    settings.values = declare(node, parameters_of(name), apply=adopted, check=settings.check)
     settings.adopt()

@@ -93,7 +93,7 @@ class NavigatorNode(Node):
         declared(self, "navigator", self._settings, self._apply)
         self._inputs = Inputs(self, ("imu/data", "attitude"))
         self._session = NavigatorSession(
-            self._settings, lambda: JobRunner(self), self._inputs, NodeLog(self.get_logger())
+            self._settings, JobRunner(self), self._inputs, NodeLog(self.get_logger())
         )
         self._outputs = NavigatorPublishers(self, self._settings)
         session, best_effort = self._session, ReliabilityPolicy.BEST_EFFORT

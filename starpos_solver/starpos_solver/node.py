@@ -13,7 +13,6 @@ from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_srvs.srv import Trigger
 
-from starpos.instrument.camera import Camera
 from starpos.recording.topics import ALL_INPUTS
 from starpos.session import reports
 from starpos.session.driver import Output, Sent
@@ -45,7 +44,7 @@ class SolverNode(Node):
     def __init__(self) -> None:
         super().__init__("solver")
         self._settings = Settings({})
-        declared(self, "solver", self._settings, self._apply, self._camera)
+        declared(self, "solver", self._settings, self._apply)
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         gyro = (IMU_TOPIC,) * self._values["gyro"]
@@ -64,11 +63,6 @@ class SolverNode(Node):
             topic=self.resolve_topic_name(CAMERA_TOPIC),
         )
         self._connect()
-
-    def _camera(self) -> Camera | None:
-        """The camera in use; None without one, as while the parameters are declared."""
-        session: SolverSession | None = getattr(self, "_session", None)
-        return None if session is None else session.instrument.camera
 
     def _connect(self) -> None:
         self._outputs = SolutionPublishers(self, self._settings)

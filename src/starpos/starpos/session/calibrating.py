@@ -25,6 +25,7 @@ from starpos.identification import Identification
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
 from starpos.instrument.tilt_log import TiltLog, TiltsByTime
+from starpos.session.camera_solver import CameraSolver
 from starpos.session.driver import Diagnosis, Jobs, Level, Log, Outcome
 from starpos.session.settings import Settings
 from starpos.session.standing import Averaging, News
@@ -170,7 +171,7 @@ OF_AVERAGE = OF_MOUNTING | {
 class Calibrating:
     """Keeps the calibration from frames: `found`, None while the parameters' calibration holds.
 
-    solver: returns the solver in use, or raises an InstrumentError that says why there is no solver.
+    instrument: the camera and the solver in use.
     changed: called when `found` changes.
     """
 
@@ -178,14 +179,14 @@ class Calibrating:
         self,
         settings: Settings,
         jobs: Jobs,
-        solver: Callable[[], Solver],
+        instrument: CameraSolver,
         changed: Callable[[], None],
         log: Log,
     ) -> None:
         self.found: Calibration | None = None
         self.average = Averaging()
         self._log = log
-        self._settings, self._solver, self._changed = settings, solver, changed
+        self._settings, self._instrument, self._changed = settings, instrument, changed
         self._values = settings.values
         self._recent: deque[Seen] = deque(maxlen=self._values["calibration_frames"])
         self._poses = PoseMemory()
@@ -323,7 +324,7 @@ class Calibrating:
             raise FixError(
                 f"only {len(frames)}{asked} frames with stars and a tilt have arrived: wait for more, or ask for fewer"
             )
-        solver = self._solver()
+        solver = self._instrument.solver_now
         site = Place.by_gravity(latitude, longitude)
         turn_deg, given = self._values["calibration_turn_stddev"], arguments_of(frames)
         return lambda: calibrate_at(solver, site=site, turn_stddev_deg=turn_deg, **given)
@@ -348,7 +349,7 @@ class Calibrating:
                 f"the instrument has stood at {_headings(len(poses))} here: turn it on the spot, to "
                 f"{MIN_HEADINGS} headings or more"
             )
-        solver = self._solver()
+        solver = self._instrument.solver_now
         turn_deg = self._values["calibration_turn_stddev"]
         return lambda: turn_on_the_spot(solver, poses, turn_deg)
 

@@ -66,9 +66,6 @@ class RecentPlaces:
         self._unstated_m = unstated_m
         self._places: list[Place] = []
 
-    def __len__(self) -> int:
-        return len(self._places)
-
     @property
     def newest(self) -> Place | None:
         """The newest place; None without one."""

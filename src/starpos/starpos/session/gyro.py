@@ -71,8 +71,7 @@ class Gyro:
     def predicted(self, stars: Stars, solver: Solver | None) -> tuple[PointingPrior, ...]:
         """The attitude of a frame whose stars are to be identified; () where it would be of no use."""
         mid_s = stars.mid_unix_s
-        turned = None if solver is None or mid_s is None else self._turned(mid_s, solver)
-        if turned is None or mid_s is None:
+        if solver is None or mid_s is None or (turned := self._turned(mid_s, solver)) is None:
             return ()
         useful = self._error(turned, mid_s) < turned.reach_rad(stars.width, stars.height)
         return (turned,) if useful else ()
@@ -82,11 +81,8 @@ class Gyro:
         mid_s, (camera, _, _) = stars.mid_unix_s, solver.view(stars.width, stars.height)
         if mid_s is None:
             return
-        seen, turned = (
-            PointingPrior(found.attitude, camera.fx * found.focal_scale),
-            self._turned(mid_s, solver),
-        )
-        if turned is not None:
+        seen = PointingPrior(found.attitude, camera.fx * found.focal_scale)
+        if (turned := self._turned(mid_s, solver)) is not None:
             off = rotation.to_vector(seen.attitude @ turned.attitude.T)
             error = math.hypot(self._error(turned, mid_s), STARS_RAD)
             self._learn(_link(solver).T @ off, error, mid_s - self._seen_s)

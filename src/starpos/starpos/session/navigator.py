@@ -94,16 +94,13 @@ class Navigated:
 
 
 class NavigatorSession:
-    """Messages of an IMU, a camera's attitudes and velocities to places under way.
+    """Messages of an IMU, a camera's attitudes and velocities to places under way; jobs: runs the adjustment."""
 
-    jobs: makes the runner of the adjustment.
-    """
-
-    def __init__(self, settings: NavigatorSettings, jobs: Callable[[], Jobs], heard: Heard, log: Log) -> None:
+    def __init__(self, settings: NavigatorSettings, jobs: Jobs, heard: Heard, log: Log) -> None:
         self.counts = {"adjustments": 0, "fixes": 0}
         self._settings, self._values = settings, settings.values
         self._heard, self._log = heard, log
-        self._jobs = jobs()
+        self._jobs = jobs
         self._changes = Changes(log)
         self.reset()
 

@@ -134,9 +134,7 @@ class SolverSession:
             lambda why: self._changes.say(why, good=False),
             topic,
         )
-        self.calibrating = Calibrating(
-            settings, waited_for(), lambda: self.instrument.solver_now, self._other_calibration, log
-        )
+        self.calibrating = Calibrating(settings, waited_for(), self.instrument, self._other_calibration, log)
         if unnamed := unnamed_inclinometer(settings.instrument(None), MODEL_BY_PARAMETERS):
             log.warning(unnamed)
 
@@ -154,6 +152,7 @@ class SolverSession:
             self.latest = replace(self.latest, refused=None)
 
     def _other_camera(self) -> None:
+        self._settings.camera = self.instrument.camera
         self._forget()
         self._search.other_camera()
         self._glows = Glows()

@@ -94,7 +94,7 @@ def test_the_middle_of_an_exposure_has_its_place_whatever_the_receivers_rate(rat
     place = places.at(START_S + until - late_s)
     assert math.degrees(place.latitude) == pytest.approx(47.0 + 1e-6 * (until - late_s), abs=1e-8)
     assert places.at(START_S + 1.0) is None
-    assert len(places) <= 2 * KEPT_S * rate_hz + 1
+    assert len(places._places) <= 2 * KEPT_S * rate_hz + 1
 
 
 def test_two_receivers_on_one_topic_are_compared_with_nothing(teacher):

@@ -322,7 +322,7 @@ def test_a_site_that_the_stars_contradict_gives_a_sentence_and_no_heading(messag
 
 def test_half_a_site_is_refused():
     settings = Settings.of(None, KNOWN)
-    said = settings.check(settings.values | {"site.latitude": 46.0}, frozenset({"site.latitude"}), None)
+    said = settings.check(settings.values | {"site.latitude": 46.0}, frozenset({"site.latitude"}))
     assert "belong together" in said
 
 
