@@ -39,7 +39,7 @@ def expected(bag):
     """(fixes, averages, attitudes) of the bag without ROS, by stamp; angles in deg, attitudes as messages."""
     fixes, averages, attitudes = {}, {}, {}
     settings = Settings.of(None, KNOWN)
-    for made in Replay(settings, Quiet(), Quiet()).play(bag):
+    for made in Replay(settings, Quiet()).play(bag):
         assert isinstance(made, Answered)
         key = made.stamp.sec, made.stamp.nanosec
         attitudes[key] = attitude_to_message(made.attitude)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node as the driver of a session: its log, its account of the inputs, its parameters."""
+"""A node as the driver of a session: its log and its account of the inputs, its parameters."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 
-from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
 
 from starpos.parameters.table import parameters_of
@@ -13,13 +12,25 @@ from starpos.session.settings import NodeSettings
 from starpos_common.diagnostics import Diagnosis, Level, Troubles, time_is_simulated
 from starpos_common.parameters import declare
 
+STALE_S = 5.0
+# seconds of an IMU at 400 Hz that may wait while a node does something else
+IMU_QUEUE = 4000
 
-class NodeLog:
-    """The node's logger for a session.  rclpy ties a severity to the calling line, so each has its own line."""
 
-    def __init__(self, logger: RcutilsLogger) -> None:
-        self._logger = logger
+class NodeDriver:
+    """Logs what a session says, and keeps account of the messages, by the relative name of their topic.
 
+    needed: names without which there is no output.
+    """
+
+    def __init__(self, node: Node, needed: Sequence[str]) -> None:
+        self.refused = 0
+        self._logger = node.get_logger()
+        self._needed = needed
+        self._came_s: dict[str, float] = {}
+        self._troubles = Troubles(node)
+
+    # rclpy ties a severity to the calling line, so each has its own line
     def info(self, message: str) -> None:
         self._logger.info(message)
 
@@ -28,24 +39,6 @@ class NodeLog:
 
     def error(self, message: str) -> None:
         self._logger.error(message, throttle_duration_sec=60.0)
-
-
-STALE_S = 5.0
-# seconds of an IMU at 400 Hz that may wait while a node does something else
-IMU_QUEUE = 4000
-
-
-class Inputs:
-    """Keeps account of the messages, by the relative name of their topic.
-
-    needed: names without which there is no output.
-    """
-
-    def __init__(self, node: Node, needed: Sequence[str]) -> None:
-        self.refused = 0
-        self._needed = needed
-        self._came_s: dict[str, float] = {}
-        self._troubles = Troubles(node)
 
     def came(self, name: str) -> None:
         """Note a message that is sound as far as is known."""

@@ -23,7 +23,7 @@ from starpos_common.topics import publisher, subscription
 from starpos_common.worker import JobRunner
 from starpos_interfaces import msg
 from starpos_solver import outputs
-from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, declared, now_of
+from starpos_solver.driver import IMU_QUEUE, NodeDriver, declared, now_of
 from starpos_solver.publishing import MOVING, MOVING_QOS, Transforms, transform_of
 
 
@@ -91,10 +91,8 @@ class NavigatorNode(Node):
         super().__init__("navigator")
         self._settings = NavigatorSettings({})
         declared(self, "navigator", self._settings, self._apply)
-        self._inputs = Inputs(self, ("imu/data", "attitude"))
-        self._session = NavigatorSession(
-            self._settings, JobRunner(self), self._inputs, NodeLog(self.get_logger())
-        )
+        self._driver = NodeDriver(self, ("imu/data", "attitude"))
+        self._session = NavigatorSession(self._settings, JobRunner(self), self._driver)
         self._outputs = NavigatorPublishers(self, self._settings)
         session, best_effort = self._session, ReliabilityPolicy.BEST_EFFORT
         subscription(self, Imu, "imu/data", self._taker(session.receive_imu), IMU_QUEUE, best_effort)
@@ -106,7 +104,7 @@ class NavigatorNode(Node):
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._diagnostics = Diagnostics(
             self,
-            {"Navigation": session.report, "Inputs": lambda: self._inputs.report({}, {})},
+            {"Navigation": session.report, "Inputs": lambda: self._driver.report({}, {})},
             self._settings.values["frame_id"],
         )
 

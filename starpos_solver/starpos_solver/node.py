@@ -26,7 +26,7 @@ from starpos_common.worker import JobRunner
 from starpos_interfaces import msg
 from starpos_interfaces.srv import Solve
 from starpos_solver.calibration_services import CalibrationServices
-from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, declared, now_of
+from starpos_solver.driver import IMU_QUEUE, NodeDriver, declared, now_of
 from starpos_solver.publishing import SolutionPublishers, StaticTransforms
 
 POLL_S = 0.02
@@ -52,13 +52,12 @@ class SolverNode(Node):
         trails, gnss = ("trails",) * orbits, (GNSS_TOPIC,) * (self._values["gnss.use"] and not orbits)
         # at a known place a heading needs no tilt
         tilt = ("tilt",) * (self._settings.site is None and not gnss)
-        self._inputs = Inputs(self, ("camera_info", "stars", *trails, *tilt, *gyro, *gnss))
+        self._driver = NodeDriver(self, ("camera_info", "stars", *trails, *tilt, *gyro, *gnss))
         self._dropped = Dropped(self, PLAY_SLOWER)
         self._session = SolverSession(
             self._settings,
             lambda: JobRunner(self, self._go_on),
-            self._inputs,
-            NodeLog(self.get_logger()),
+            self._driver,
             arrived=self._arrived,
             topic=self.resolve_topic_name(CAMERA_TOPIC),
         )
@@ -94,7 +93,7 @@ class SolverNode(Node):
         self._tick = self.get_clock().create_jump_callback(TICK, post_callback=lambda _: self._go_on())
         tasks = {
             "Solution": self._report_solution,
-            "Inputs": lambda: self._inputs.report({"tilts kept": len(session.tilts)}, self._dropped.counts),
+            "Inputs": lambda: self._driver.report({"tilts kept": len(session.tilts)}, self._dropped.counts),
             "Outputs": self._report_outputs,
             "Clock": self._report_clock,
             "Conditions": self._report_conditions,

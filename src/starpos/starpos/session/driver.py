@@ -99,13 +99,11 @@ Output = Answered | BySatellites
 
 
 class Log(Protocol):
-    """Takes sentences, as rclpy's logger does; of an error, which is a defect, the traceback."""
+    """Takes sentences, as rclpy's logger does."""
 
     def info(self, message: str) -> object: ...
 
     def warning(self, message: str) -> object: ...
-
-    def error(self, message: str) -> object: ...
 
 
 class Changes:
@@ -128,8 +126,10 @@ class Changes:
         return True
 
 
-class Heard(Protocol):
-    """Keeps account of the messages, by the relative name of their topic."""
+class Driver(Log, Protocol):
+    """Whoever drives a session: a log, also of defects' tracebacks, and an account of messages by their topics' names."""
+
+    def error(self, message: str) -> object: ...
 
     def came(self, name: str) -> object: ...
 
@@ -137,14 +137,14 @@ class Heard(Protocol):
 
 
 @contextmanager
-def refusing(heard: Heard, name: str) -> Iterator[None]:
+def refusing(driver: Driver, name: str) -> Iterator[None]:
     """Refuse a message of a topic with the reason where the block raises a StarposError, else note that it came."""
     try:
         yield
     except StarposError as error:
-        heard.refuse(name, str(error))
+        driver.refuse(name, str(error))
     else:
-        heard.came(name)
+        driver.came(name)
 
 
 class Level(IntEnum):

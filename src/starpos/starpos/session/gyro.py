@@ -15,7 +15,7 @@ from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.identification import Identification, PointingPrior
 from starpos.navigation.records import ImuModel
-from starpos.session.driver import Heard, Now
+from starpos.session.driver import Driver, Now
 
 if TYPE_CHECKING:
     from starpos.session.gyro_readings import GyroReadings
@@ -38,8 +38,8 @@ class Gyro:
     pair of attitudes improves the bias.
     """
 
-    def __init__(self, heard: Heard) -> None:
-        self._heard = heard
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
         self._readings: GyroReadings | None = None
         self.forget()
 
@@ -64,9 +64,9 @@ class Gyro:
             self._readings = GyroReadings()
         try:
             self._readings.receive(message)
-            self._heard.came(IMU_TOPIC)
+            self._driver.came(IMU_TOPIC)
         except VoyageError as e:
-            self._heard.refuse(IMU_TOPIC, str(e))
+            self._driver.refuse(IMU_TOPIC, str(e))
 
     def predicted(self, stars: Stars, solver: Solver | None) -> tuple[PointingPrior, ...]:
         """The attitude of a frame whose stars are to be identified; () where it would be of no use."""
@@ -92,7 +92,7 @@ class Gyro:
         """Learn the bias from the gyro's error (3,), rad along its axes, after a time, and the sigma of this error."""
         if np.linalg.norm(off) > CONTRADICTION * error:
             degrees = math.degrees(np.linalg.norm(off))
-            self._heard.refuse(
+            self._driver.refuse(
                 IMU_TOPIC,
                 f"the gyro is {degrees:.3g} deg off the stars after {since_s:.3g} s: give rad/s along the axes that "
                 "calibration_url's link_to_camera turns into the camera's",

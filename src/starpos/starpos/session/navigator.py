@@ -29,7 +29,7 @@ from starpos.navigation.records import ImuModel, read_imu_model
 from starpos.navigation.sightings import PlacelessFrame, SunFrame, body_attitude
 from starpos.navigation.vessel import PARKED, Vessel
 from starpos.navigation.voyage import MIN_FRAMES, Voyage
-from starpos.session.driver import Changes, Diagnosis, Heard, Jobs, Level, Log, Now, Outcome, refusing
+from starpos.session.driver import Changes, Diagnosis, Driver, Jobs, Level, Now, Outcome, refusing
 from starpos.session.gnss import OLDEST_S, ComparedPlaces, contradiction
 from starpos.session.reports import AHEAD_S
 from starpos.session.settings import MIN_CLOCK_S, NodeSettings
@@ -96,12 +96,12 @@ class Navigated:
 class NavigatorSession:
     """Messages of an IMU, a camera's attitudes and velocities to places under way; jobs: runs the adjustment."""
 
-    def __init__(self, settings: NavigatorSettings, jobs: Jobs, heard: Heard, log: Log) -> None:
+    def __init__(self, settings: NavigatorSettings, jobs: Jobs, driver: Driver) -> None:
         self.counts = {"adjustments": 0, "fixes": 0}
         self._settings, self._values = settings, settings.values
-        self._heard, self._log = heard, log
+        self._driver = driver
         self._jobs = jobs
-        self._changes = Changes(log)
+        self._changes = Changes(driver)
         self.reset()
 
     def reset(self) -> None:
@@ -132,7 +132,7 @@ class NavigatorSession:
         w, f, stamp = message.angular_velocity, message.linear_acceleration, message.header.stamp
         row = (stamp.sec + stamp.nanosec * 1e-9, w.x, w.y, w.z, f.x, f.y, f.z)
         due = False
-        with refusing(self._heard, "imu/data"):
+        with refusing(self._driver, "imu/data"):
             if (
                 message.angular_velocity_covariance[0] == -1
                 or message.linear_acceleration_covariance[0] == -1
@@ -149,7 +149,7 @@ class NavigatorSession:
 
     def receive_attitude(self, message: Any, now: Now) -> list[Navigated]:
         """Take a starpos_interfaces/Attitude."""
-        with refusing(self._heard, "attitude"):
+        with refusing(self._driver, "attitude"):
             attitude = message_to_attitude(message)
             self._check_time(attitude.utc_unix_s, now, "an attitude")
             assert attitude.utc_unix_s is not None
@@ -177,7 +177,7 @@ class NavigatorSession:
         try:
             gnss = self._gnss.at(utc_unix_s)
         except GnssError as e:
-            self._heard.refuse("gnss/fix", str(e))
+            self._driver.refuse("gnss/fix", str(e))
             return None
         return None if gnss is None else gnss.deflected(self._settings.vertical)
 
@@ -185,7 +185,7 @@ class NavigatorSession:
         """Take a nav_msgs/Odometry or a geometry_msgs/TwistWithCovarianceStamped, from the topic of that name."""
         v = message.twist.twist.linear
         variance = np.asarray(message.twist.covariance, float)[[0, 7, 14]]
-        with refusing(self._heard, name):
+        with refusing(self._driver, name):
             time_s = stamp_to_unix(message.header.stamp)
             self._check_time(time_s, now, "a velocity")
             assert time_s is not None
@@ -201,7 +201,7 @@ class NavigatorSession:
     def receive_gnss(self, message: Any, now: Now) -> list[Navigated]:
         """Take a sensor_msgs/NavSatFix of satellites: it is compared, not fused."""
         self._gnss.receive(message, now)
-        self._heard.came("gnss/fix")
+        self._driver.came("gnss/fix")
         return []
 
     def _check_time(self, unix_s: float | None, now: Now, what: str) -> None:
@@ -217,7 +217,7 @@ class NavigatorSession:
         """Begin a new voyage where an IMU was away or its clock was set: what happened meanwhile is not known."""
         away_s = time_s - self._recent.readings.last_s
         if math.isfinite(away_s) and (away_s > LONGEST_GAP_S or away_s < -BACK_S):
-            self._log.warning(
+            self._driver.warning(
                 f"the IMU's stamps {'jump by' if away_s > 0 else 'go back by'} {abs(away_s):.3g} s: begun anew"
             )
             self.reset()

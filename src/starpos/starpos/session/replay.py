@@ -26,7 +26,7 @@ from starpos.night.reading import stars_of
 from starpos.recording import topics
 from starpos.recording.bag import BagReader
 from starpos.recording.drivers import DriverMessages, Drivers
-from starpos.session.driver import Answered, Heard, JobsInTurn, Log, Now, Output
+from starpos.session.driver import Answered, Driver, JobsInTurn, Now, Output
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings
 
@@ -42,17 +42,17 @@ class Replay:
     remarks: sentences on how a robot's own messages are used.
     """
 
-    def __init__(self, settings: Settings, heard: Heard, log: Log, drivers: Drivers | None = None) -> None:
+    def __init__(self, settings: Settings, driver: Driver, drivers: Drivers | None = None) -> None:
         self.frames = 0
         self.remarks: list[str] = []
         self._jobs: list[JobsInTurn] = []
-        self._heard, self._log = heard, log
+        self._driver = driver
         self._drivers = Drivers.of() if drivers is None else drivers
         self._messages = DriverMessages(self._drivers)
-        self.session = SolverSession(settings, self._new_jobs, heard, log)
+        self.session = SolverSession(settings, self._new_jobs, driver)
 
     def _new_jobs(self) -> JobsInTurn:
-        self._jobs.append(JobsInTurn(self._log.error))
+        self._jobs.append(JobsInTurn(self._driver.error))
         return self._jobs[-1]
 
     def play(self, path: Path, namespace: str | None = None) -> Iterator[Output]:
@@ -105,7 +105,7 @@ class Replay:
             try:
                 stars, header = self._messages.stars_of(kind, message)
             except StarposError as error:
-                self._heard.refuse("image_raw", str(error))
+                self._driver.refuse("image_raw", str(error))
                 return []
             return session.receive_detected(stars, header, now)
         if kind == topics.CAPTURE:
@@ -217,9 +217,7 @@ class Playing:
         settings = Settings.of(self.params_file, given, self.namespace)
         night = PlayedNight(instrument=settings.instrument(None))
         said = _Said(night)
-        replay = Replay(
-            settings, said, said, Drivers.of(self.params_file, self.given, self.namespace, self.remaps)
-        )
+        replay = Replay(settings, said, Drivers.of(self.params_file, self.given, self.namespace, self.remaps))
         try:
             for output in play(replay):
                 if isinstance(output, Answered):

@@ -20,7 +20,7 @@ from starpos.satellites.elements import StoredOrbits, chosen
 from starpos.satellites.frames import FrameSky
 from starpos.satellites.locating import SatelliteFix, locate
 from starpos.satellites.trails import SatelliteTrail
-from starpos.session.driver import BySatellites, Diagnosis, Heard, Jobs, Level, Output, refusing
+from starpos.session.driver import BySatellites, Diagnosis, Driver, Jobs, Level, Output, refusing
 from starpos.session.settings import Settings
 from starpos.sky import catalogue
 
@@ -45,8 +45,8 @@ class Located:
 class LiveSatellites:
     """Collects trails of identified frames while satellites.elements is set; each frame with trails begins a job."""
 
-    def __init__(self, settings: Settings, orbits: StoredOrbits, jobs: Jobs, heard: Heard) -> None:
-        self._settings, self._orbits, self._jobs, self._heard = settings, orbits, jobs, heard
+    def __init__(self, settings: Settings, orbits: StoredOrbits, jobs: Jobs, driver: Driver) -> None:
+        self._settings, self._orbits, self._jobs, self._driver = settings, orbits, jobs, driver
         self._catalogue = catalogue.load_catalogue()
         self.forget()
 
@@ -64,7 +64,7 @@ class LiveSatellites:
     # what comes -------------------------------------------------------------------------------------------------------
 
     def receive(self, message: Any) -> None:
-        with refusing(self._heard, "trails"):
+        with refusing(self._driver, "trails"):
             stamp, ns = message.header.stamp, stamp_to_ns(message.header.stamp)
             self._found[ns] = stamp, message_to_trails(message)
             self._pair(ns)

@@ -34,7 +34,7 @@ from starpos.session import reports
 from starpos.session.calibrating import OF_AVERAGE, OF_MOUNTING, Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.deflection import LiveDeflection
-from starpos.session.driver import Answered, Changes, Heard, Jobs, Log, Now, Output, Sent, refusing
+from starpos.session.driver import Answered, Changes, Driver, Jobs, Now, Output, Sent, refusing
 from starpos.session.gnss import GnssTeacher, SessionPlaces
 from starpos.session.gyro import Gyro
 from starpos.session.pace import MAX_WAITING, Backlog, Pace, Waiting
@@ -71,8 +71,7 @@ class SolverSession:
         self,
         settings: Settings,
         jobs: Callable[[], Jobs],
-        heard: Heard,
-        log: Log,
+        driver: Driver,
         *,
         arrived: Callable[[str], Iterable[tuple[Any, Sent]]] = lambda name: (),
         topic: str = CAMERA_TOPIC,
@@ -93,15 +92,15 @@ class SolverSession:
         self.tilts = TiltBuffer(settings)
         self.doubt = ClockDoubt()
         self._level = LevelDoubt()
-        self.gyro = Gyro(heard)
+        self.gyro = Gyro(driver)
         self.satellites: LiveSatellites | None = None
         if settings.orbits is not None:
             from starpos.session import satellites
 
-            self.satellites = satellites.LiveSatellites(settings, settings.orbits, waited_for(), heard)
+            self.satellites = satellites.LiveSatellites(settings, settings.orbits, waited_for(), driver)
         self.gnss: GnssTeacher | None = None
         if settings.values["gnss.use"]:
-            self.gnss = GnssTeacher(settings, jobs(), heard, log, self.satellites)
+            self.gnss = GnssTeacher(settings, jobs(), driver, self.satellites)
         self._take: dict[str, Take] = {
             CAMERA_INFO: self._take_camera,
             TILT: self._take_tilt,
@@ -119,14 +118,14 @@ class SolverSession:
         self._catalogue = catalogue.load_catalogue()
         # This reads the tables of the Earth's rotation, so that the first frame is not slow.
         earth_state(J2000_UNIX_S)
-        self._heard, self._log = heard, log
+        self._driver = driver
         self._arrived = arrived
         self._backlog = Backlog()
         self._was_s: float | None = None
         self._ended = False
         # from the last fix
         self._hint: Hint | None = None
-        self._changes = Changes(log)
+        self._changes = Changes(driver)
         self.instrument = CameraSolver(
             self._make_solver,
             self._other_camera,
@@ -134,9 +133,11 @@ class SolverSession:
             lambda why: self._changes.say(why, good=False),
             topic,
         )
-        self.calibrating = Calibrating(settings, waited_for(), self.instrument, self._other_calibration, log)
+        self.calibrating = Calibrating(
+            settings, waited_for(), self.instrument, self._other_calibration, driver
+        )
         if unnamed := unnamed_inclinometer(settings.instrument(None), MODEL_BY_PARAMETERS):
-            log.warning(unnamed)
+            driver.warning(unnamed)
 
     def _make_solver(self, camera: Camera) -> Solver:
         return self._settings.solver(camera, self.calibrating.found, self._catalogue)
@@ -211,11 +212,11 @@ class SolverSession:
         return made + self._work(now)
 
     def _take_camera(self, message: Any, now: Now, sent: Sent) -> None:
-        with refusing(self._heard, "camera_info"):
+        with refusing(self._driver, "camera_info"):
             self.instrument.receive(message, at_once=not now.played)
 
     def _take_tilt(self, message: Any, now: Now, sent: Sent) -> None:
-        with refusing(self._heard, "tilt"):
+        with refusing(self._driver, "tilt"):
             self.tilts.receive(message, sent, now)
 
     def _take_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
@@ -247,7 +248,7 @@ class SolverSession:
 
     def _takes(self, header: Any, now: Now, sent: Sent) -> bool:
         """Whether a frame is wanted and can be answered in time."""
-        self._heard.came("stars")
+        self._driver.came("stars")
         if not now.played:
             self.pace.numbered(sent.number, now.waiting_s)
         if not self.pace.wants(stamp_to_unix(header.stamp), self._values["max_rate"]):
@@ -267,7 +268,7 @@ class SolverSession:
         self.instrument.note_frame_size(stars.width, stars.height, at_once=not now.played)
         if len(self._backlog) >= MAX_WAITING:
             self.pace.drop(now.waiting_s)
-            self._heard.refuse("stars", f"a frame was dropped: {MAX_WAITING} wait for their tilts")
+            self._driver.refuse("stars", f"a frame was dropped: {MAX_WAITING} wait for their tilts")
             return
         ahead_s = now.ahead_s(stars.mid_unix_s)
         self._backlog.append(Waiting(header=header, stars=stars, since_s=now.waiting_s, ahead_s=ahead_s))
@@ -307,7 +308,7 @@ class SolverSession:
             self.tilts.forget_publishers()
         if now.unix_s > was_s:
             for message in self.tilts.pop_early():
-                with refusing(self._heard, "tilt"):
+                with refusing(self._driver, "tilt"):
                     self.tilts.keep_in_time(message, now)
 
     def _work(self, now: Now) -> list[Output]:
@@ -383,7 +384,7 @@ class SolverSession:
         try:
             return work()
         except Exception as e:
-            self._log.error(traceback.format_exc())
+            self._driver.error(traceback.format_exc())
             return instead(e)
 
     def _question(self, frame: Waiting, **known: Any) -> Question:

@@ -72,7 +72,7 @@ def trail(**changes):
 def test_a_trail_that_cannot_be_is_refused(live, changes):
     header = SimpleNamespace(stamp=STAMP)
     live.receive(SimpleNamespace(header=header, trails=[trail(**changes)]))
-    ((name, sentence),) = live._heard.refused
+    ((name, sentence),) = live._driver.refused
     assert name == "trails" and "impossible" in sentence
     live.receive(SimpleNamespace(header=header, trails=[trail()]))
     # its stars have not come: nothing to look at

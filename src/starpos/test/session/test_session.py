@@ -60,9 +60,7 @@ class Told:
 
     def __init__(self, *parameters):
         self.said, self.jobs = Said(), []
-        self.session = SolverSession(
-            Settings.of(None, (*KNOWN, *parameters)), self._new, self.said, self.said
-        )
+        self.session = SolverSession(Settings.of(None, (*KNOWN, *parameters)), self._new, self.said)
 
     def _new(self):
         self.jobs.append(JobsInTurn(self.said.error))
@@ -250,9 +248,7 @@ def test_how_long_a_job_takes_does_not_matter_to_recorded_frames(messages):
 def test_a_replay_twice_is_the_same():
     def played():
         said = Said()
-        return [
-            repr(replace(m, stamp=None)) for m in Replay(Settings.of(None, KNOWN), said, said).play(NIGHT)
-        ]
+        return [repr(replace(m, stamp=None)) for m in Replay(Settings.of(None, KNOWN), said).play(NIGHT)]
 
     first = played()
     assert first == played() and len(first) == 10
