@@ -62,8 +62,7 @@ class PlacelessFrame(FrameUnderWay):
 
     @classmethod
     def of(cls, attitude: CameraAttitude) -> "PlacelessFrame":
-        """The frame of an attitude that has a time; TimeError outside the IERS tables."""
-        assert attitude.utc_unix_s is not None
+        """The frame of an attitude; TimeError outside the IERS tables."""
         turn = attitude.camera_to_gcrs
         among_stars = Attitude(turn, turn @ attitude.covariance @ turn.T, of=CAMERA, into=GCRS)
         return cls(
@@ -164,8 +163,8 @@ class SunFrame(FrameUnderWay):
 
     @classmethod
     def of(cls, seen: CameraAttitude, place: Place) -> "SunFrame":
-        """The frame of an attitude that has a time and a ray; FrameError for another direction than the Sun's."""
-        assert seen.utc_unix_s is not None and seen.ray is not None
+        """The frame of an attitude that has a ray; FrameError for another direction than the Sun's."""
+        assert seen.ray is not None
         state = earth_state(seen.utc_unix_s)
         body, turn = body_at(SUN, state), state.gcrs_to_itrs @ seen.camera_to_gcrs
         if np.linalg.norm(turn @ seen.ray - body.itrs) > SUN_NEAR:

@@ -73,8 +73,8 @@ class Gyro:
         mid_s = stars.mid_unix_s
         if solver is None or mid_s is None or (turned := self._turned(mid_s, solver)) is None:
             return ()
-        useful = self._error(turned, mid_s) < turned.reach_rad(stars.width, stars.height)
-        return (turned,) if useful else ()
+        prior, error = turned
+        return (prior,) if error < prior.reach_rad(stars.width, stars.height) else ()
 
     def learn_from(self, stars: Stars, found: Identification, solver: Solver) -> None:
         """Take an attitude from stars identified beyond doubt, and learn the bias from it."""
@@ -83,9 +83,9 @@ class Gyro:
             return
         seen = PointingPrior(found.attitude, camera.fx * found.focal_scale)
         if (turned := self._turned(mid_s, solver)) is not None:
-            off = rotation.to_vector(seen.attitude @ turned.attitude.T)
-            error = math.hypot(self._error(turned, mid_s), STARS_RAD)
-            self._learn(_link(solver).T @ off, error, mid_s - self._seen_s)
+            prior, error = turned
+            off = rotation.to_vector(seen.attitude @ prior.attitude.T)
+            self._learn(_link(solver).T @ off, math.hypot(error, STARS_RAD), mid_s - self._seen_s)
         self._seen, self._seen_s = seen, mid_s
 
     def _learn(self, off: np.ndarray, error: float, since_s: float) -> None:
@@ -103,24 +103,20 @@ class Gyro:
         self._bias = self._bias + share * off / since_s
         self._bias_stddev = max(self._bias_stddev * math.sqrt(1 - share), MIN_BIAS_STDDEV)
 
-    def _turned(self, mid_s: float, solver: Solver) -> PointingPrior | None:
-        """The last attitude, turned on to a time; None without one, or where readings lack."""
-        if self._seen is None or self._readings is None:
+    def _turned(self, mid_s: float, solver: Solver) -> tuple[PointingPrior, float] | None:
+        """The last attitude, turned on to a time, and its error, one sigma an axis (rad); None where readings lack."""
+        seen = self._seen
+        if seen is None or self._readings is None:
             return None
         turn = self._readings.turn(self._seen_s, mid_s, MAX_MISSING_S, self._bias)
         if turn is None:
             return None
-        link = _link(solver)
-        return PointingPrior(link @ turn.T @ link.T @ self._seen.attitude, self._seen.focal_px)
-
-    def _error(self, turned: PointingPrior, mid_s: float) -> float:
-        """One sigma an axis, rad, of the attitude that is turned on to a time."""
-        assert self._seen is not None
-        since_s = mid_s - self._seen_s
-        angle = float(np.linalg.norm(rotation.to_vector(turned.attitude @ self._seen.attitude.T)))
+        link, since_s = _link(solver), mid_s - self._seen_s
+        turned = PointingPrior(link @ turn.T @ link.T @ seen.attitude, seen.focal_px)
+        angle = float(np.linalg.norm(rotation.to_vector(turned.attitude @ seen.attitude.T)))
         shares = math.hypot(WORST.scale_stddev, WORST.axes_stddev, MOUNT_RAD)
         noise = WORST.gyroscope_noise_density * math.sqrt(since_s)
-        return math.hypot(noise, self._bias_stddev * since_s, shares * angle)
+        return turned, math.hypot(noise, self._bias_stddev * since_s, shares * angle)
 
 
 def _link(solver: Solver) -> np.ndarray:

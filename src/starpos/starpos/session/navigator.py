@@ -141,7 +141,7 @@ class NavigatorSession:
                     "the IMU says by a covariance of -1 that it measures no rates or no accelerations: use "
                     "one that does"
                 )
-            self._check_time(row[0], now, "an inertial reading")
+            self._checked(row[0], now, "an inertial reading")
             self._begin_anew(row[0])
             self._recent.readings.append(row)
             due = row[0] >= self._next_s
@@ -151,11 +151,10 @@ class NavigatorSession:
         """Take a starpos_interfaces/Attitude."""
         with refusing(self._driver, "attitude"):
             attitude = message_to_attitude(message)
-            self._check_time(attitude.utc_unix_s, now, "an attitude")
-            assert attitude.utc_unix_s is not None
+            time_s = self._checked(attitude.utc_unix_s, now, "an attitude")
             by_sun, place = attitude.ray is not None, None
             if by_sun or self._estimate is None or self._stars_missing:
-                place = self._place_at(attitude.utc_unix_s)
+                place = self._place_at(time_s)
             if by_sun and place is None:
                 raise VoyageError(
                     "the Sun gives a heading only at a known place: set site.latitude and site.longitude, or gnss.use "
@@ -186,9 +185,7 @@ class NavigatorSession:
         v = message.twist.twist.linear
         variance = np.asarray(message.twist.covariance, float)[[0, 7, 14]]
         with refusing(self._driver, name):
-            time_s = stamp_to_unix(message.header.stamp)
-            self._check_time(time_s, now, "a velocity")
-            assert time_s is not None
+            time_s = self._checked(stamp_to_unix(message.header.stamp), now, "a velocity")
             if not variance.min() >= 0:
                 raise VoyageError(
                     "a velocity's variance is NaN or below 0: state it, or zeros for velocity_stddev"
@@ -204,7 +201,8 @@ class NavigatorSession:
         self._driver.came("gnss/fix")
         return []
 
-    def _check_time(self, unix_s: float | None, now: Now, what: str) -> None:
+    def _checked(self, unix_s: float | None, now: Now, what: str) -> float:
+        """The time of a message; VoyageError if there is none, or one in the future."""
         if not unix_s:
             raise VoyageError(f"{what} has no time stamp: set header.stamp to when it was measured")
         if now.ahead_s(unix_s) > AHEAD_S:
@@ -212,6 +210,7 @@ class NavigatorSession:
                 f"{what} is stamped {now.ahead_s(unix_s):.3g} s in the future: set the clocks of camera, IMU and "
                 "navigator by one source"
             )
+        return unix_s
 
     def _begin_anew(self, time_s: float) -> None:
         """Begin a new voyage where an IMU was away or its clock was set: what happened meanwhile is not known."""
