@@ -150,19 +150,14 @@ class GnssTeacher:
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        jobs: Jobs,
-        driver: Driver,
-        satellites: "LiveSatellites | None" = None,
+        self, settings: Settings, jobs: Jobs, driver: Driver, satellites: "LiveSatellites | None" = None
     ) -> None:
         self.newest: Watched | None = None
-        self._settings, self._values, self._jobs = settings, settings.values, jobs
-        self._driver = driver
+        self._settings, self._values = settings, settings.values
+        self._jobs, self._driver = jobs, driver
         self.places, self._satellites = RecentPlaces(), satellites
         self._watch: GnssWatch | None = None
         self._instrument: Instrument | None = None
-        self._stored: Learned | None = settings.learned
         self._saved_s = -math.inf
         # what the file holds
         self._saved = settings.learned
@@ -171,7 +166,7 @@ class GnssTeacher:
     @property
     def learned(self) -> Learned | None:
         """What is known of the instrument now."""
-        return self._stored if self._watch is None else self._watch.learned
+        return self._settings.learned if self._watch is None else self._watch.learned
 
     def receive(self, message: Any, now: Now) -> None:
         """Keep the place of a sensor_msgs/NavSatFix; one that cannot be used is refused with the reason."""
@@ -193,7 +188,7 @@ class GnssTeacher:
         """The watch of an instrument; a new one where A3 or the inclinometer is stated otherwise."""
         before = self._instrument
         if self._watch is None:
-            self._watch = GnssWatch(instrument, self._settings.vertical, self._stored)
+            self._watch = GnssWatch(instrument, self._settings.vertical, self._settings.learned)
         elif before is not None and (
             before.calibration != instrument.calibration or before.inclinometer != instrument.inclinometer
         ):

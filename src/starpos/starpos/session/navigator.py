@@ -202,7 +202,7 @@ class NavigatorSession:
         return []
 
     def _checked(self, unix_s: float | None, now: Now, what: str) -> float:
-        """The time of a message; VoyageError if there is none, or one in the future."""
+        """The time of a message; VoyageError without one, or for one in the future."""
         if not unix_s:
             raise VoyageError(f"{what} has no time stamp: set header.stamp to when it was measured")
         if now.ahead_s(unix_s) > AHEAD_S:
