@@ -16,7 +16,7 @@ from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import Header
 
 from starpos.instrument.instrument import Instrument
-from starpos.session.driver import Answered, BySatellites, Output
+from starpos.session.driver import Answered, Output
 from starpos.session.settings import Settings
 from starpos_common.messages import attitude_to_message, quaternion
 from starpos_common.topics import publisher
@@ -147,7 +147,7 @@ class SolutionPublishers:
 
     def publish(self, output: Output) -> None:
         header = self._header(output.stamp)
-        if isinstance(output, BySatellites):
+        if not isinstance(output, Answered):
             if self._by_satellites is not None:
                 self._by_satellites.publish(outputs.fix_by_satellites(header, output.fix))
             return

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from starpos.fix.solution import Solution
     from starpos.gnss.watch import GnssCheck
     from starpos.satellites.locating import SatelliteFix
+    from starpos.satellites.trails import SatelliteTrail
 
 # Times that differ by more are not of the same evening.
 ANOTHER_TIME_S = 3600.0
@@ -87,15 +88,21 @@ class Answered:
     average: "Average | None" = None
 
 
-@dataclass(frozen=True)
-class BySatellites:
-    """The place by the satellites on the last frames, None where they give none; with the stamp of the newest."""
+@dataclass(frozen=True, kw_only=True)
+class Located:
+    """The place by the satellites' trails on the last frames, or why it is missing, and a sentence on what is left out.
+
+    stamp: of the newest frame.
+    """
 
     stamp: Any
-    fix: "SatelliteFix | None"
+    trails: "tuple[SatelliteTrail, ...]"
+    fix: "SatelliteFix | None" = None
+    why: str = ""
+    left_out: str = ""
 
 
-Output = Answered | BySatellites
+Output = Answered | Located
 
 
 class Log(Protocol):

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,9 @@ from starpos.messages.stars import message_to_trails
 from starpos.satellites.adjustment import KnownBefore
 from starpos.satellites.elements import StoredOrbits, chosen
 from starpos.satellites.frames import FrameSky
-from starpos.satellites.locating import SatelliteFix, locate
+from starpos.satellites.locating import locate
 from starpos.satellites.trails import SatelliteTrail
-from starpos.session.driver import BySatellites, Diagnosis, Driver, Jobs, Level, Output, refusing
+from starpos.session.driver import Diagnosis, Driver, Jobs, Level, Located, refusing
 from starpos.session.settings import Settings
 from starpos.sky import catalogue
 
@@ -30,16 +30,6 @@ KEPT = 32
 # large: together they have the information of one place.
 TEACHES = 40
 Frame = tuple[Any, Stars, Solution, list[FrameTrail]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Located:
-    """Result of a job: the trails that count, the place or why it is missing, and a sentence on what is left out."""
-
-    trails: tuple[SatelliteTrail, ...]
-    fix: SatelliteFix | None = None
-    why: str = ""
-    left_out: str = ""
 
 
 class LiveSatellites:
@@ -56,7 +46,7 @@ class LiveSatellites:
         self._found: dict[int, tuple[Any, list[FrameTrail]]] = {}
         self._waiting: list[Frame] = []
         self._newest: Located | None = None
-        self._made: list[Output] = []
+        self._made: list[Located] = []
         self._place: Place | None = None
         self._taught = 0
         self._jobs.disown()
@@ -84,7 +74,7 @@ class LiveSatellites:
             while len(kept) > KEPT:
                 kept.pop(next(iter(kept)))
 
-    def fetch(self) -> list[Output]:
+    def fetch(self) -> list[Located]:
         """What was found since the last call; begins to look at frames that wait."""
         if self._waiting and not self._jobs.busy:
             self._begin()
@@ -106,12 +96,12 @@ class LiveSatellites:
         self._jobs.run(
             lambda: located(frames, trails, self._orbits, self._catalogue, prior, window_s),
             # a defect loses these frames' trails
-            lambda o: self._take(frames[-1][0], o.value or Located(trails=trails, why=o.trouble)),
+            lambda o: self._take(o.value or Located(stamp=frames[-1][0], trails=trails, why=o.trouble)),
         )
 
-    def _take(self, stamp: Any, found: Located) -> None:
+    def _take(self, found: Located) -> None:
         self._newest = found
-        self._made.append(BySatellites(stamp, found.fix))
+        self._made.append(found)
         if (fix := found.fix) is not None:
             utc_unix_s = float(found.trails[-1].utc_unix_s[0])
             self._place = gnss_place(utc_unix_s, fix.latitude, fix.longitude, fix.covariance[:2, :2])
@@ -186,7 +176,7 @@ def located(
             left_out = seen.left_out or left_out
     begin = max((float(t.utc_unix_s[0]) for t in trails), default=0.0) - window_s
     kept = tuple(replace(t, track=k) for k, t in enumerate(t for t in trails if t.utc_unix_s[0] >= begin))
-    made = Located(trails=kept, left_out=left_out)
+    made = Located(stamp=frames[-1][0], trails=kept, left_out=left_out)
     if not kept:
         return replace(made, why="no trail shows an end of its exposure")
     try:

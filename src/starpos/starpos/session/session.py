@@ -314,7 +314,7 @@ class SolverSession:
     def _work(self, now: Now) -> list[Output]:
         """Answer what can be answered, and have the trails of these frames looked at."""
         made = self._answers(now)
-        return made if self.satellites is None else made + self.satellites.fetch()
+        return made if self.satellites is None else [*made, *self.satellites.fetch()]
 
     def _answers(self, now: Now) -> list[Output]:
         """Answer the first frames that have everything they need: of recorded ones all, live one at a time."""

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from starpos.session.driver import JobsInTurn, Level
-from starpos.session.satellites import TEACHES, LiveSatellites, Located
+from starpos.session.driver import JobsInTurn, Level, Located
+from starpos.session.satellites import TEACHES, LiveSatellites
 from starpos.session.settings import Settings
 from starpos_testing.skies import orbits
 
@@ -39,7 +39,7 @@ def live(tmp_path):
 def placed(live):
     """Have it know a place."""
     fix = SimpleNamespace(latitude=0.8, longitude=0.1, covariance=np.diag([900.0, 1600.0, 400.0]))
-    live._take(STAMP, Located(trails=(SimpleNamespace(utc_unix_s=np.array([NIGHT])),), fix=fix))
+    live._take(Located(stamp=STAMP, trails=(SimpleNamespace(utc_unix_s=np.array([NIGHT])),), fix=fix))
     return fix
 
 
