@@ -208,7 +208,6 @@ def _type_hash(name: str) -> str:
 class BagWriter:
     """Writes messages unchanged, compressed; the folder is a bag once it is closed.
 
-    trouble: why it cannot be written any more; '' if it can.
     Raises BagError if rosbags is not installed, or if the folder exists already or cannot be made.
     """
 
@@ -217,7 +216,7 @@ class BagWriter:
             from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
         except ImportError:
             raise BagError("rosbags, which writes bags, is not installed: pip install rosbags") from None
-        self.folder, self.count, self.trouble = folder, 0, ""
+        self.folder, self.count = folder, 0
         self.store = installed_types()
         self._connections: dict[str, Connection] = {}
         try:
@@ -241,8 +240,9 @@ class BagWriter:
         try:
             self._writer.write(self._connections[topic], log_ns, data)
         except OSError as error:
-            self.trouble = f"{self.folder}: it cannot be written ({error.strerror}): the recording ends"
-            raise BagError(self.trouble) from None
+            raise BagError(
+                f"{self.folder}: it cannot be written ({error.strerror}): the recording ends"
+            ) from None
         self.count += 1
 
     def close(self) -> None:
@@ -250,9 +250,9 @@ class BagWriter:
         try:
             self._writer.close()
         except OSError as error:
-            why = f"its end cannot be written ({error.strerror}): `mcap recover` gets back what is in it"
-            self.trouble = f"{self.folder}: {why}"
-            raise BagError(self.trouble) from None
+            raise BagError(
+                f"{self.folder}: its end cannot be written ({error.strerror}): `mcap recover` gets back what is in it"
+            ) from None
 
 
 def offered_qos(latched: bool = False) -> "Qos":

@@ -31,13 +31,16 @@ def record() -> int:
     except BagError as error:
         say(str(error))
         return REFUSED
+    recorders: list[Recorder] = []
 
     def make_nodes() -> "Iterator[Recorder]":
         from starpos_bringup.recorder import Recorder
 
-        yield Recorder(writer, topics, say)
+        recorders.append(Recorder(writer, topics, say))
+        yield recorders[0]
 
-    return run(make_nodes) or (BROKEN_OFF if writer.trouble else SAVED)
+    status = run(make_nodes)
+    return status or (BROKEN_OFF if any(r.trouble for r in recorders) else SAVED)
 
 
 def parser_of(executable: str) -> argparse.ArgumentParser:

@@ -39,6 +39,8 @@ class Recorder(Node):
 
     def __init__(self, writer: BagWriter, topics: Mapping[str, Mapping], say: Callable[[str], None]) -> None:
         super().__init__("record", start_parameter_services=False)
+        # Why the recording broke off.
+        self.trouble = ""
         self._writer, self._say = writer, say
         for name, row in topics.items():
             package, message = row["type"].split("/msg/")
@@ -56,16 +58,18 @@ class Recorder(Node):
             self._writer.close()
             self._say(f"{self._writer.folder}: {self._writer.count} messages")
         except BagError as error:
-            self._say(str(error))
+            self.trouble = str(error)
+            self._say(self.trouble)
 
     def _keep(self, name: str, topic: str, data: bytes) -> None:
-        if self._writer.trouble:
+        if self.trouble:
             return
         try:
             self._writer.write(topic, self.get_clock().now().nanoseconds, data)
             self._counts[name] += 1
         except BagError as error:
-            self._say(str(error))
+            self.trouble = str(error)
+            self._say(self.trouble)
             rclpy.shutdown()
 
     def _report(self) -> Diagnosis:

@@ -87,27 +87,36 @@ def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt
     ahead_s: how far it was ahead of this node's clock.  doubt_s: how far the stars contradict it, or 0.
     """
     values = {"clock sigma (s)": clock_stddev_s, "stamp sigma (s)": stamp_stddev_s, "frame age (s)": -ahead_s}
-    wide = float(np.hypot(clock_stddev_s, stamp_stddev_s))
     if ahead_s > AHEAD_S:
-        wrong = f"frames are stamped {ahead_s:.3g} s in the future and are refused: {ONE_CLOCK}"
-    elif doubt_s:
-        wrong = (
-            f"the camera is at rest, but the sky has turned by {doubt_s:.3g} s more than the stamps say: a clock was "
-            "set, or a frame stamped wrongly. Fixes include this error until the clock is back or solver/reset is called"
+        return Diagnosis(
+            Level.WARN,
+            f"frames are stamped {ahead_s:.3g} s in the future and are refused: {ONE_CLOCK}",
+            values,
         )
-    elif OLD_S < -ahead_s < ANOTHER_TIME_S or -ahead_s > SINCE_BOOT_S:
-        wrong = (
+    if doubt_s:
+        return Diagnosis(
+            Level.WARN,
+            f"the camera is at rest, but the sky has turned by {doubt_s:.3g} s more than the stamps say: a "
+            f"clock was set, or a frame stamped wrongly. Fixes include this error until the clock is back "
+            f"or solver/reset is called",
+            values,
+        )
+    if OLD_S < -ahead_s < ANOTHER_TIME_S or -ahead_s > SINCE_BOOT_S:
+        return Diagnosis(
+            Level.WARN,
             f"frames are stamped {-ahead_s:.3g} s behind this node's clock: if they are taken now, they belong to "
-            f"another clock, and so does their longitude: {ONE_CLOCK}"
+            f"another clock, and so does their longitude: {ONE_CLOCK}",
+            values,
         )
-    elif wide > WIDE_CLOCK_S:
-        wrong = (
+    wide = float(np.hypot(clock_stddev_s, stamp_stddev_s))
+    if wide > WIDE_CLOCK_S:
+        return Diagnosis(
+            Level.WARN,
             f"the time is known to {wide:.2g} s only, {wide * EQUATOR_M_PER_S:.0f} m at the equator: synchronise the "
-            "camera's clock, or set clock_stddev where you know better"
+            "camera's clock, or set clock_stddev where you know better",
+            values,
         )
-    else:
-        return Diagnosis(Level.OK, f"the time is known to {wide:.2g} s", values)
-    return Diagnosis(Level.WARN, wrong, values)
+    return Diagnosis(Level.OK, f"the time is known to {wide:.2g} s", values)
 
 
 def of_conditions(
