@@ -156,7 +156,7 @@ def test_a_bag_of_a_day_and_a_night_is_replayed_without_a_gap(tmp_path, frames):
     bag.close()
     answers = [
         made.solution
-        for made in Replay(Settings.of(None, SOLVER), Quiet(), Quiet()).play(tmp_path / "bag")
+        for made in Replay(Settings.of(None, SOLVER), Quiet()).play(tmp_path / "bag")
         if isinstance(made, Answered)
     ]
     assert [s.bodies for s in answers] == [("sun",)] * len(DAY) + [()] * (len(DUSK) + len(NIGHT))

@@ -38,17 +38,17 @@ def bag(tmp_path_factory):
 def expected(bag):
     """(fixes, averages, attitudes) of the bag without ROS, by stamp; angles in deg, attitudes as messages."""
     fixes, averages, attitudes = {}, {}, {}
-    for made in Replay(Settings.of(None, KNOWN), Quiet(), Quiet()).play(bag):
-        kept = fixes if isinstance(made, Answered) else averages
-        ground = made.ground
-        if isinstance(made, Answered):
-            attitude = attitude_to_message(made.attitude)
-            attitudes[made.stamp.sec, made.stamp.nanosec] = attitude
-        kept[made.stamp.sec, made.stamp.nanosec] = (
-            math.degrees(ground.latitude),
-            math.degrees(ground.longitude),
-            *ground.covariance[:2, :2].ravel().tolist(),
-        )
+    settings = Settings.of(None, KNOWN)
+    for made in Replay(settings, Quiet()).play(bag):
+        assert isinstance(made, Answered)
+        key = made.stamp.sec, made.stamp.nanosec
+        attitudes[key] = attitude_to_message(made.attitude)
+        for kept, ground in (fixes, made.ground), (averages, made.average.on_ground(settings.vertical)):
+            kept[key] = (
+                math.degrees(ground.latitude),
+                math.degrees(ground.longitude),
+                *ground.covariance[:2, :2].ravel().tolist(),
+            )
     assert len(fixes) == len(averages) == len(attitudes) == 2
     return fixes, averages, attitudes
 

@@ -32,7 +32,7 @@ def told(latitude_deg, longitude_deg, covariance):
 @pytest.fixture(scope="module")
 def expected(bag):
     """The fixes of the bag without ROS, by stamp."""
-    replay = Replay(Settings.of(PARAMETERS, ()), Quiet(), Quiet(), Drivers.of(PARAMETERS, ()))
+    replay = Replay(Settings.of(PARAMETERS, ()), Quiet(), Drivers.of(PARAMETERS, ()))
     fixes = {}
     for made in replay.play(bag):
         if (ground := getattr(made, "ground", None)) and hasattr(made, "solution"):

@@ -24,11 +24,10 @@ from starpos.messages.camera import (
     CAPTURES_KEPT,
     ExposureFacts,
     check_stamp,
-    key_of,
     message_to_frame,
     message_to_picture,
 )
-from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.stamp import stamp_to_ns, stamp_to_unix
 from starpos.parameters.table import parameters_of
 from starpos.session.driver import Changes
 from starpos.session.pace import MAX_LATE_S, Pace
@@ -65,7 +64,7 @@ class FrameTopics:
         if self.compressed_topic == node.resolve_topic_name(COMPRESSED, only_expand=True):
             self.compressed_topic = f"{node.resolve_topic_name(RAW)}/compressed"
         # stamps of the last frames of each topic
-        self._stamps = {kind: deque[tuple[int, int]](maxlen=STAMPS_KEPT) for kind in (Image, CompressedImage)}
+        self._stamps = {kind: deque[int](maxlen=STAMPS_KEPT) for kind in (Image, CompressedImage)}
         self._raw_sends = False
         self._compressed: MatchedSubscription | None = None
         self._raw = MatchedSubscription(node, Image, RAW, self._pass_raw, IMAGE_DEPTH)
@@ -119,7 +118,7 @@ class FrameTopics:
 
     def _pass_once(self, message: Any, info: Mapping[str, Any], other: type) -> None:
         """Pass a message on, unless its frame has come on the other topic."""
-        stamp = key_of(message.header)
+        stamp = stamp_to_ns(message.header.stamp)
         self._stamps[type(message)].append(stamp)
         if stamp not in self._stamps[other]:
             # a bag that is played again has the same stamps

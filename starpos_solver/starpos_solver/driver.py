@@ -1,27 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node as the driver of a session: its log, its account of the inputs, its parameters."""
+"""A node as the driver of a session: its log and its account of the inputs, its parameters."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
-from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
 
-from starpos.instrument.camera import Camera
 from starpos.parameters.table import parameters_of
 from starpos.session.driver import Now
 from starpos.session.settings import NodeSettings
 from starpos_common.diagnostics import Diagnosis, Level, Troubles, time_is_simulated
 from starpos_common.parameters import declare
 
+STALE_S = 5.0
+# seconds of an IMU at 400 Hz that may wait while a node does something else
+IMU_QUEUE = 4000
 
-class NodeLog:
-    """The node's logger for a session.  rclpy ties a severity to the calling line, so each has its own line."""
 
-    def __init__(self, logger: RcutilsLogger) -> None:
-        self._logger = logger
+class NodeDriver:
+    """Logs what a session says, and keeps account of the messages, by the relative name of their topic.
 
+    needed: names without which there is no output.
+    """
+
+    def __init__(self, node: Node, needed: Sequence[str]) -> None:
+        self.refused = 0
+        self._logger = node.get_logger()
+        self._needed = needed
+        self._came_s: dict[str, float] = {}
+        self._troubles = Troubles(node)
+
+    # rclpy ties a severity to the calling line, so each has its own line
     def info(self, message: str) -> None:
         self._logger.info(message)
 
@@ -30,24 +39,6 @@ class NodeLog:
 
     def error(self, message: str) -> None:
         self._logger.error(message, throttle_duration_sec=60.0)
-
-
-STALE_S = 5.0
-# seconds of an IMU at 400 Hz that may wait while a node does something else
-IMU_QUEUE = 4000
-
-
-class Inputs:
-    """Keeps account of the messages, by the relative name of their topic.
-
-    needed: names without which there is no output.
-    """
-
-    def __init__(self, node: Node, needed: Sequence[str]) -> None:
-        self.refused = 0
-        self._needed = needed
-        self._came_s: dict[str, float] = {}
-        self._troubles = Troubles(node)
 
     def came(self, name: str) -> None:
         """Note a message that is sound as far as is known."""
@@ -83,24 +74,15 @@ def now_of(node: Node) -> Now:
     return Now.in_data(unix_s) if time_is_simulated(node) else Now(unix_s, time.monotonic())
 
 
-def declared(
-    node: Node,
-    name: str,
-    settings: NodeSettings,
-    apply: Callable[[frozenset[str]], None],
-    camera: Callable[[], Camera | None] = lambda: None,
-) -> None:
+def declared(node: Node, name: str, settings: NodeSettings, apply: Callable[[frozenset[str]], None]) -> None:
     """Declare the parameters of the node of that name for its settings, which may be set while it runs.
 
-    apply: called with the names that were set.  camera: returns the camera in use, None before there is one.
+    apply: called with the names that were set.
     """
 
     def adopted(names: frozenset[str]) -> None:
         settings.adopt()
         apply(names)
 
-    def check(values: Mapping[str, Any], names: frozenset[str]) -> str | None:
-        return settings.check(values, names, camera())
-
-    settings.values = declare(node, parameters_of(name), apply=adopted, check=check)
+    settings.values = declare(node, parameters_of(name), apply=adopted, check=settings.check)
     settings.adopt()

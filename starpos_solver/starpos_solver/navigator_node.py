@@ -23,7 +23,7 @@ from starpos_common.topics import publisher, subscription
 from starpos_common.worker import JobRunner
 from starpos_interfaces import msg
 from starpos_solver import outputs
-from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, declared, now_of
+from starpos_solver.driver import IMU_QUEUE, NodeDriver, declared, now_of
 from starpos_solver.publishing import MOVING, MOVING_QOS, Transforms, transform_of
 
 
@@ -49,8 +49,7 @@ class NavigatorPublishers:
         if output.at_place is not None:
             self._heading.publish(outputs.imu(header, output.at_place))
             return
-        altitude = self._values["altitude"], self._values["altitude_stddev"]
-        self._fix.publish(outputs.nav_sat_fix(header, output.ground, *altitude))
+        self._fix.publish(outputs.nav_sat_fix(header, output.ground, self._values))
         if output.fix is None or output.ground is None:
             return
         link = outputs.true_north(output.fix.link, output.ground)
@@ -68,13 +67,13 @@ def odometry(header: Header, child: str, output: Navigated, link: Attitude) -> O
 
     link: attitude of the base link in true-north ENU.
     """
-    fix, displacement = output.fix, output.displacement
-    assert fix is not None and displacement is not None
+    assert output.fix is not None and output.displacement is not None
+    fix, (displacement, covariance) = output.fix, output.displacement
     message = Odometry(header=header, child_frame_id=child)
     message.pose.pose.position = Point(**dict(zip("xyz", displacement.tolist(), strict=True)))
     message.pose.pose.orientation = quaternion(link.rotation)
     pose, twist = np.zeros((2, 6, 6))
-    pose[:3, :3], pose[3:, 3:] = output.displacement_covariance, link.covariance
+    pose[:3, :3], pose[3:, 3:] = covariance, link.covariance
     message.pose.covariance = pose.ravel()
     velocity = fix.link.rotation.T @ fix.velocity
     message.twist.twist.linear = Vector3(**dict(zip("xyz", velocity.tolist(), strict=True)))
@@ -92,10 +91,8 @@ class NavigatorNode(Node):
         super().__init__("navigator")
         self._settings = NavigatorSettings({})
         declared(self, "navigator", self._settings, self._apply)
-        self._inputs = Inputs(self, ("imu/data", "attitude"))
-        self._session = NavigatorSession(
-            self._settings, lambda: JobRunner(self), self._inputs, NodeLog(self.get_logger())
-        )
+        self._driver = NodeDriver(self, ("imu/data", "attitude"))
+        self._session = NavigatorSession(self._settings, JobRunner(self), self._driver)
         self._outputs = NavigatorPublishers(self, self._settings)
         session, best_effort = self._session, ReliabilityPolicy.BEST_EFFORT
         subscription(self, Imu, "imu/data", self._taker(session.receive_imu), IMU_QUEUE, best_effort)
@@ -107,7 +104,7 @@ class NavigatorNode(Node):
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._diagnostics = Diagnostics(
             self,
-            {"Navigation": session.report, "Inputs": lambda: self._inputs.report({}, {})},
+            {"Navigation": session.report, "Inputs": lambda: self._driver.report({}, {})},
             self._settings.values["frame_id"],
         )
 

@@ -10,11 +10,9 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_srvs.srv import Trigger
 
-from starpos.instrument.camera import Camera
 from starpos.recording.topics import ALL_INPUTS
 from starpos.session import reports
 from starpos.session.driver import Output, Sent
@@ -28,11 +26,12 @@ from starpos_common.worker import JobRunner
 from starpos_interfaces import msg
 from starpos_interfaces.srv import Solve
 from starpos_solver.calibration_services import CalibrationServices
-from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, declared, now_of
+from starpos_solver.driver import IMU_QUEUE, NodeDriver, declared, now_of
 from starpos_solver.publishing import SolutionPublishers, StaticTransforms
 
 POLL_S = 0.02
-TILT_QUEUE, STARS_QUEUE = 1000, 100
+# messages that may wait for the executor
+QUEUES = {"tilt": 1000, "stars": 100}
 PLAY_SLOWER = (
     "play it slower, or by `ros2 run starpos_bringup replay`; frames without them have other fixes, or none"
 )
@@ -45,7 +44,7 @@ class SolverNode(Node):
     def __init__(self) -> None:
         super().__init__("solver")
         self._settings = Settings({})
-        declared(self, "solver", self._settings, self._apply, self._camera)
+        declared(self, "solver", self._settings, self._apply)
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         gyro = (IMU_TOPIC,) * self._values["gyro"]
@@ -53,31 +52,26 @@ class SolverNode(Node):
         trails, gnss = ("trails",) * orbits, (GNSS_TOPIC,) * (self._values["gnss.use"] and not orbits)
         # at a known place a heading needs no tilt
         tilt = ("tilt",) * (self._settings.site is None and not gnss)
-        self._inputs = Inputs(self, ("camera_info", "stars", *trails, *tilt, *gyro, *gnss))
+        self._driver = NodeDriver(self, ("camera_info", "stars", *trails, *tilt, *gyro, *gnss))
         self._dropped = Dropped(self, PLAY_SLOWER)
         self._session = SolverSession(
             self._settings,
             lambda: JobRunner(self, self._go_on),
-            self._inputs,
-            NodeLog(self.get_logger()),
-            arrived=lambda: self._arrived(self._tilts, "tilt", TILT_QUEUE),
-            arrived_stars=lambda: self._arrived(self._stars, "stars", STARS_QUEUE),
+            self._driver,
+            arrived=self._arrived,
             topic=self.resolve_topic_name(CAMERA_TOPIC),
         )
         self._connect()
-
-    def _camera(self) -> Camera | None:
-        """The camera in use; None without one, as while the parameters are declared."""
-        session: SolverSession | None = getattr(self, "_session", None)
-        return None if session is None else session.instrument.camera
 
     def _connect(self) -> None:
         self._outputs = SolutionPublishers(self, self._settings)
         self._transforms = StaticTransforms(self)
         session = self._session
         subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._taker(CAMERA_TOPIC), 10)
-        self._tilts = subscription(self, msg.Tilt, "tilt", self._taker("tilt"), TILT_QUEUE)
-        self._stars = subscription(self, msg.StarArray, "stars", self._taker("stars"), STARS_QUEUE)
+        self._ears = {
+            name: subscription(self, kind, name, self._taker(name), QUEUES[name])
+            for name, kind in (("tilt", msg.Tilt), ("stars", msg.StarArray))
+        }
         if session.satellites is not None:
             subscription(self, msg.TrailArray, "trails", self._taker("trails"), 10)
         self._again = self.create_guard_condition(self._go_on)
@@ -99,7 +93,7 @@ class SolverNode(Node):
         self._tick = self.get_clock().create_jump_callback(TICK, post_callback=lambda _: self._go_on())
         tasks = {
             "Solution": self._report_solution,
-            "Inputs": lambda: self._inputs.report({"tilts kept": len(session.tilts)}, self._dropped.counts),
+            "Inputs": lambda: self._driver.report({"tilts kept": len(session.tilts)}, self._dropped.counts),
             "Outputs": self._report_outputs,
             "Clock": self._report_clock,
             "Conditions": self._report_conditions,
@@ -146,13 +140,11 @@ class SolverNode(Node):
         if time_is_simulated(self):
             self._dropped.came(name, info)
 
-    def _arrived(self, ear: Subscription, name: str, most: int) -> Iterator[tuple[Any, Sent]]:
-        """Read what has arrived but waits for the executor.
-
-        name: relative one of the topic.  most: messages that may wait.
-        """
+    def _arrived(self, name: str) -> Iterator[tuple[Any, Sent]]:
+        """Read what has arrived of a topic, by its relative name, but waits for the executor."""
+        ear = self._ears[name]
         with ear.handle:
-            for _ in range(most):
+            for _ in range(QUEUES[name]):
                 taken = ear.handle.take_message(ear.msg_type, False)
                 if taken is None:
                     return

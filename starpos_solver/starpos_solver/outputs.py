@@ -2,8 +2,9 @@
 """Messages of a solution: NavSatFix, Imu, Solution."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
@@ -36,14 +37,17 @@ NUMBERS = [
 ]
 
 
-def nav_sat_fix(
-    header: Header, ground: Geodetic | None, altitude: float, altitude_stddev: float
-) -> NavSatFix:
-    """Make a NavSatFix on WGS 84; without a position NO_FIX with NaN, so that consumers see the instrument at work."""
-    covariance = np.zeros((3, 3))
+def nav_sat_fix(header: Header, ground: Geodetic | None, values: Mapping[str, Any]) -> NavSatFix:
+    """Make a NavSatFix on WGS 84; without a position NO_FIX with NaN, so that consumers see the instrument at work.
+
+    values: the node's parameters, of which altitude and altitude_stddev are the height.
+    """
+    altitude, covariance = values["altitude"], np.zeros((3, 3))
     if ground is not None:
         covariance[:2, :2] = ground.covariance[:2, :2]
-        covariance[2, 2] = UNKNOWN_ALTITUDE_VARIANCE if math.isnan(altitude) else altitude_stddev**2
+        covariance[2, 2] = (
+            UNKNOWN_ALTITUDE_VARIANCE if math.isnan(altitude) else values["altitude_stddev"] ** 2
+        )
     return _nav_sat_fix(header, ground, altitude, covariance)
 
 

@@ -15,9 +15,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import Header
 
-from starpos.earth.vertical import Geodetic
 from starpos.instrument.instrument import Instrument
-from starpos.session.driver import Answered, Averaged, BySatellites, Output
+from starpos.session.driver import Answered, Output
 from starpos.session.settings import Settings
 from starpos_common.messages import attitude_to_message, quaternion
 from starpos_common.topics import publisher
@@ -148,14 +147,11 @@ class SolutionPublishers:
 
     def publish(self, output: Output) -> None:
         header = self._header(output.stamp)
-        if isinstance(output, Averaged):
-            self._fix_averaged.publish(self._nav_sat_fix(header, output.ground))
-            return
-        if isinstance(output, BySatellites):
+        if not isinstance(output, Answered):
             if self._by_satellites is not None:
                 self._by_satellites.publish(outputs.fix_by_satellites(header, output.fix))
             return
-        self._fix.publish(self._nav_sat_fix(header, output.ground))
+        self._fix.publish(outputs.nav_sat_fix(header, output.ground, self._values))
         fix, at_place = output.solution.fix, output.solution.at_place
         if at_place is not None:
             self._imu.publish(outputs.imu(header, at_place.true_north))
@@ -166,6 +162,9 @@ class SolutionPublishers:
         if output.attitude is not None:
             self._attitude.publish(attitude_to_message(output.attitude))
         self._solution.publish(self.solution(output))
+        if output.average is not None:
+            ground = output.average.on_ground(self._settings.vertical)
+            self._fix_averaged.publish(outputs.nav_sat_fix(header, ground, self._values))
 
     def solution(self, answered: Answered) -> msg.Solution:
         message = outputs.solution(self._header(answered.stamp), answered.solution, answered.ground)
@@ -175,6 +174,3 @@ class SolutionPublishers:
 
     def _header(self, stamp: Time) -> Header:
         return Header(stamp=stamp, frame_id=self._values["frame_id"])
-
-    def _nav_sat_fix(self, header: Header, ground: Geodetic | None) -> NavSatFix:
-        return outputs.nav_sat_fix(header, ground, self._values["altitude"], self._values["altitude_stddev"])

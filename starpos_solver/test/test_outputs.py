@@ -24,6 +24,7 @@ from starpos_solver import outputs
 from starpos_testing.headings import yaw_deg
 
 EXACT = Deflection(0.0, 0.0, 0.0)
+HEIGHT = {"altitude": 250.0, "altitude_stddev": 10.0}
 
 
 def fix_facing(azimuth_deg: float, latitude_deg: float = 40.0) -> Fix:
@@ -109,20 +110,22 @@ def test_rates_and_accelerations_are_declared_unmeasured():
 
 def test_a_fix_has_a_known_covariance_of_east_and_north():
     ground = answer_facing(10.0).fix.on_ground(EXACT)
-    message = outputs.nav_sat_fix(Header(), ground, 250.0, 10.0)
+    message = outputs.nav_sat_fix(Header(), ground, HEIGHT)
     assert message.status.status == NavSatStatus.STATUS_FIX
     assert message.position_covariance_type == NavSatFix.COVARIANCE_TYPE_KNOWN
     assert np.diag(np.array(message.position_covariance).reshape(3, 3)) == pytest.approx([1e4, 2500.0, 100.0])
 
 
 def test_an_unset_altitude_stays_nan_and_its_variance_finite():
-    message = outputs.nav_sat_fix(Header(), answer_facing(10.0).fix.on_ground(EXACT), math.nan, 10.0)
+    message = outputs.nav_sat_fix(
+        Header(), answer_facing(10.0).fix.on_ground(EXACT), HEIGHT | {"altitude": math.nan}
+    )
     assert math.isnan(message.altitude)
     assert np.isfinite(message.position_covariance).all()
 
 
 def test_no_fix_is_nan_with_an_unknown_covariance():
-    message = outputs.nav_sat_fix(Header(), None, 250.0, 10.0)
+    message = outputs.nav_sat_fix(Header(), None, HEIGHT)
     assert message.status.status == NavSatStatus.STATUS_NO_FIX
     assert math.isnan(message.latitude) and math.isnan(message.longitude) and math.isnan(message.altitude)
     assert message.position_covariance_type == NavSatFix.COVARIANCE_TYPE_UNKNOWN

@@ -28,7 +28,8 @@ def make():
         nodes.append(rclpy.create_node("settings", context=context, parameter_overrides=overrides))
         applied = []
         settings = Settings({})
-        declared(nodes[-1], "solver", settings, applied.append, lambda: CAMERA)
+        settings.camera = CAMERA
+        declared(nodes[-1], "solver", settings, applied.append)
         return nodes[-1], settings, applied
 
     yield make

@@ -67,25 +67,21 @@ def dashboard(told: Mapping[str, str], parameters: Mapping[str, Mapping] = {}) -
     return [process("starpos_dashboard", "dashboard", told, parameters)] if wanted else []
 
 
-# Package, executable and nodes of each process of an instrument; camera and detector are one.
+# Package and executable of each process of an instrument; camera and detector are one.
 INSTRUMENT = (
-    ("starpos_camera", "camera_detector", ("camera", "detector")),
-    ("starpos_inclinometer", "inclinometer", ("inclinometer",)),
-    ("starpos_solver", "solver", ("solver",)),
+    ("starpos_camera", "camera_detector"),
+    ("starpos_inclinometer", "inclinometer"),
+    ("starpos_solver", "solver"),
 )
 
 
 def instrument(
     told: Mapping[str, str], parameters: Mapping[str, Mapping] = {}, defaults: Mapping[str, Mapping] = {}
 ) -> list[Node]:
-    """Make the processes of an instrument; parameters and defaults of its nodes as in `process`."""
-
-    def of(nodes: Sequence[str], every: Mapping[str, Mapping]) -> dict[str, Mapping]:
-        return {name: values for name, values in every.items() if name in ("**", *nodes)}
-
+    """Make the processes of an instrument; parameters and defaults of all its nodes as in `process`."""
     return [
-        process(package, executable, told, of(nodes, parameters), defaults=of(nodes, defaults))
-        for package, executable, nodes in INSTRUMENT
+        process(package, executable, told, parameters, defaults=defaults)
+        for package, executable in INSTRUMENT
     ]
 
 
@@ -102,8 +98,8 @@ def process(
     """Make a process; LaunchError if an argument is wrong.
 
     The first mapping has the values of the launch file's arguments.
-    parameters, defaults: of its nodes, by name ('**' is all); the parameter file counts less than parameters, more
-    than defaults.  remaps: topics by the names that the nodes know them by.
+    parameters, defaults: of nodes, by name ('**' is all), of which each takes its own; the parameter file counts less
+    than parameters, more than defaults.  remaps: topics by the names that the nodes know them by.
     """
     renamed = [word for name, topic in remaps.items() for word in ("-r", f"{name}:={topic}")]
     # launch_ros only warns of a missing file, and the instrument would run with defaults

@@ -17,12 +17,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 
-from starpos.recording.topics import IMAGE, IMU, PICTURE, SOLUTION, STARS
+from starpos.recording.topics import FRAMES, IMAGES, IMU, SOLUTION, STARS
 from starpos_bringup.bag import Topic
 from starpos_interfaces.msg import Solution, StarArray
 
-IMAGES = (IMAGE, PICTURE)
-FRAMES = (STARS, *IMAGES)
 CLOCK_PERIOD_S = 0.025
 ACKNOWLEDGED_S = 3.0
 # How far the bag's time goes on beyond a frame that is not answered: solver and detector wait for later messages.
@@ -67,6 +65,7 @@ class Player:
         topics = tuple(topics)
         # by the bag's name of a topic
         self._publishers = {t.name: self._publisher(t) for t in topics}
+        self._every = (*self._publishers.values(), self._clock)
         self._frame_publishers = [self._publishers[t.name] for t in topics if t.type_name in FRAMES]
         # by the name that the graph knows it by, which the user may have remapped
         self._played = {p.topic_name for p in self._publishers.values()}
@@ -123,8 +122,7 @@ class Player:
             )
 
     def _all_listen(self) -> bool:
-        every = [*self._publishers.values(), self._clock]
-        return all(p.get_subscription_count() for p in every)
+        return all(p.get_subscription_count() for p in self._every)
 
     def _chain(self) -> bool:
         """Whether a solver is there, and star lists are played or made."""
@@ -157,8 +155,7 @@ class Player:
     def _settled(self) -> bool:
         """Whether no new listener has come for SETTLED_S, and those in the graph are matched."""
         self._find()
-        publishers = [*self._publishers.values(), self._clock]
-        listeners = [self._node.count_subscribers(p.topic_name) for p in publishers]
+        listeners = [self._node.count_subscribers(p.topic_name) for p in self._every]
         if listeners != self._listeners:
             self._listeners, self._unchanged_since_s = listeners, time.monotonic()
         return time.monotonic() - self._unchanged_since_s >= SETTLED_S
@@ -178,7 +175,7 @@ class Player:
         if self._unanswered and not self._await(over):
             self._unanswered.clear()
         if not self._stopped:
-            for publisher in (*self._publishers.values(), self._clock):
+            for publisher in self._every:
                 publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGED_S))
 
     def play(self, topic: Topic, log_ns: int, data: bytes) -> None:

@@ -6,9 +6,10 @@ import rclpy
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
+from starpos.recording.topics import FRAMES
 from starpos_bringup import player as module
 from starpos_bringup.bag import Topic
-from starpos_bringup.player import FRAMES, Player
+from starpos_bringup.player import Player
 from starpos_interfaces.msg import Solution, StarArray
 from starpos_testing.nodes import take_domain
 

@@ -23,7 +23,6 @@ from starpos.instrument.inclinometer import Tilt
 from starpos.messages.stars import FIRST_CUT, SECOND_CUT, UNSTEADY
 from starpos_interfaces import msg
 
-HOST_IS_BIG_ENDIAN = sys.byteorder == "big"
 # The end of Time.sec, in January 2038.
 MAX_UNIX_S = 2**31 - 1e-6
 
@@ -174,7 +173,7 @@ def frame_to_message(frame: Frame, frame_id: str) -> Image:
         width=frame.width,
         height=frame.height,
         encoding=encoding_of(frame),
-        is_bigendian=int(HOST_IS_BIG_ENDIAN),
+        is_bigendian=int(sys.byteorder == "big"),
         step=pixels.strides[0],
     )
     message.data = data

@@ -164,9 +164,8 @@ class MatchedSubscription:
                 f"{_nodes(others)} sends {kinds} on {self.topic}, which takes {self._type}: remap it to the topic "
                 "that carries this type."
             )
-        silent = [p for p in self.publishers if self._qos.reliability == RELIABLE]
-        silent = [p for p in silent if p.qos_profile.reliability == BEST_EFFORT]
-        if not silent:
+        silent = [p for p in self.publishers if p.qos_profile.reliability == BEST_EFFORT]
+        if not silent or self._qos.reliability != RELIABLE:
             return ""
         return (
             f"{_nodes(silent)} cannot be heard on {self.topic}: it offers best effort, and another publisher of the "

@@ -14,7 +14,7 @@ from starpos.frames.exposure import UNKNOWN_STAMP, DriverStamp
 from starpos.frames.frame import Frame
 from starpos.frames.pictures import picture_pixels
 from starpos.instrument.camera import Camera, check_axis, stated_lens
-from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.stamp import stamp_to_ns, stamp_to_unix
 from starpos.messages.stars import message_to_shutter
 
 
@@ -102,7 +102,6 @@ def message_to_picture(message: Any, source: str = "image_raw/compressed") -> Fr
 CAPTURES_KEPT = 16
 # Capture.stamp_source of one that does not know
 UNKNOWN_SOURCE = 0
-NANO = 10**9
 
 
 class ExposureFacts:
@@ -116,7 +115,7 @@ class ExposureFacts:
         # whether Captures have come that state only exposures
         self._exposures_come = False
         # the oldest first
-        self._captures: dict[tuple[int, int], Any] = {}
+        self._captures: dict[int, Any] = {}
         # facts for a frame whose Capture is lost; None: no Capture has ever come
         self._usual: dict[str, Any] | None = None
 
@@ -124,11 +123,11 @@ class ExposureFacts:
         """Keep a Capture for its frame."""
         if len(self._captures) >= CAPTURES_KEPT:
             del self._captures[next(iter(self._captures))]
-        self._captures[key_of(message.header)] = message
+        self._captures[stamp_to_ns(message.header.stamp)] = message
 
     def has(self, header: Any) -> bool:
         """Whether the Capture of a frame is here."""
-        return key_of(header) in self._captures
+        return stamp_to_ns(header.stamp) in self._captures
 
     @property
     def missing_statement(self) -> str:
@@ -145,8 +144,8 @@ class ExposureFacts:
         under automatic exposure, and the parameters give the rest. The frame has the stamp of its message.
         Raises StarposError for impossible values.
         """
-        stamp_ns = header.stamp.sec * NANO + header.stamp.nanosec
-        capture = self._captures.pop(key_of(header), None)
+        stamp_ns = stamp_to_ns(header.stamp)
+        capture = self._captures.pop(stamp_ns, None)
         told = None if capture is None else _facts_of(capture)
         # whether it leaves the meaning of the stamp to the parameters
         unsaid = capture is not None and capture.stamp_source == UNKNOWN_SOURCE
@@ -181,19 +180,14 @@ def _facts_of(capture: Any) -> dict[str, Any]:
     return {"exposure_s": exposure, **errors, "shutter": message_to_shutter(capture)}
 
 
-def key_of(header: Any) -> tuple[int, int]:
-    """The stamp of a message, s and ns, which identifies the messages of one frame."""
-    return header.stamp.sec, header.stamp.nanosec
-
-
 def check_stamp(header: Any) -> None:
     """Raise TimeError if the stamp of an image is not set, or is not a time."""
-    sec, nanosec = key_of(header)
+    sec, nanosec = header.stamp.sec, header.stamp.nanosec
     if not sec and not nanosec:
         raise TimeError(
             "image_raw: the frame has no time stamp; set header.stamp to the middle of the exposure."
         )
-    if sec < 0 or nanosec >= NANO:
+    if sec < 0 or nanosec >= 10**9:
         raise TimeError(
             f"image_raw: the stamp {sec} s {nanosec} ns is no time after 1970; check the camera's clock."
         )

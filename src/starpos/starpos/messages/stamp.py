@@ -26,6 +26,11 @@ class PlainHeader:
     frame_id: str
 
 
+def stamp_to_ns(stamp: Any) -> int:
+    """Nanoseconds since 1970 of a stamp, by which the messages of one frame are known."""
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
 def stamp_to_unix(stamp: Any) -> float | None:
     """Unix seconds of a stamp, to the microsecond; None for 0, which means that the time is unknown."""
     if stamp.sec == 0 and stamp.nanosec == 0:

@@ -14,7 +14,7 @@ from starpos.errors import TiltError
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import MAX_CELSIUS, SCA100T_NOISE_RAD, SQUARE, Tilt
 from starpos.instrument.tilt_log import NoiseTracker, copies
-from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
+from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_ns, stamp_to_unix
 from starpos.units import STANDARD_GRAVITY
 
 # bits of Tilt.flags, as starpos_interfaces defines them
@@ -145,7 +145,7 @@ class Acceleration:
 
 def acceleration_of(message: Any) -> Acceleration:
     """Read a message; TiltError if it has no stamp or holds NaN, infinity or a negative variance."""
-    stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+    stamp_ns = stamp_to_ns(message.header.stamp)
     if stamp_ns <= 0:
         raise TiltError("has no stamp")
     a, w = message.linear_acceleration, message.angular_velocity

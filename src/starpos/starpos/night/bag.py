@@ -24,15 +24,13 @@ from starpos.night.solving import Exposures, Worked
 from starpos.night.work import Solving
 from starpos.progress import Progress
 from starpos.recording.bag import BagReader
-from starpos.recording.drivers import IMAGES, DriverMessages, Drivers
-from starpos.recording.topics import CAMERA_INFO, CAPTURE, IMU, INPUTS, STARS, TILT, instrument_in
+from starpos.recording.drivers import DriverMessages, Drivers
+from starpos.recording.topics import CAMERA_INFO, CAPTURE, FRAMES, IMU, INPUTS, STARS, TILT, instrument_in
 from starpos.units import utc_text
 
 SUFFIXES = (".mcap", ".db3")
 # of ROS 1, which is refused with a sentence
 ROS1_SUFFIX = ".bag"
-# types of messages that are a frame each
-WITH_STARS = (STARS, *IMAGES)
 
 
 def is_bag(path: Path) -> bool:
@@ -64,7 +62,7 @@ def exposures(
     unusable = 0
     with BagReader(path, typed=True) as bag:
         chosen = instrument_in(bag, namespace, INPUTS, drivers.remaps)
-        wanted = [c for c in chosen.connections if c.msgtype not in WITH_STARS]
+        wanted = [c for c in chosen.connections if c.msgtype not in FRAMES]
         total = sum(c.msgcount for c in wanted) or 1
         for done, (connection, log_ns, message) in enumerate(bag.decoded(wanted), 1):
             if done % 500 == 0 or done == total:
@@ -104,7 +102,7 @@ def exposures(
     return Exposures(
         name=path.name + (f" {chosen.namespace}" if chosen.namespace != "/" else ""),
         origin=f"solved from stars and tilt of the bag {path.name}, namespace {chosen.namespace}",
-        count=sum(c.msgcount for c in chosen.connections if c.msgtype in WITH_STARS),
+        count=sum(c.msgcount for c in chosen.connections if c.msgtype in FRAMES),
         each=each,
         work=Solving(
             replace(given, cameras=cameras if own_cameras else {}), atmosphere=atmosphere, tilts=level
@@ -120,7 +118,7 @@ def _frames(path: Path, namespace: str, drivers: Drivers) -> Iterator[tuple[str,
     messages = DriverMessages(drivers)
     with BagReader(path, typed=True) as bag:
         chosen = instrument_in(bag, namespace, INPUTS, drivers.remaps)
-        wanted = [c for c in chosen.connections if c.msgtype in (*WITH_STARS, CAPTURE)]
+        wanted = [c for c in chosen.connections if c.msgtype in (*FRAMES, CAPTURE)]
         for connection, _, message in bag.decoded(wanted):
             if connection.msgtype == CAPTURE:
                 messages.receive_capture(message)

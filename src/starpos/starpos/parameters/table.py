@@ -123,17 +123,15 @@ class Parameter:
         kind = type(self.items[0])
         if kind is float and type(item) is int:
             item = float(item)
-        if type(item) is not kind or _is_large(item) or (self.choices and item not in self.choices):
-            raise self._error(whole)
-        if self.form and not self.form.fits(item):
-            raise self._error(whole)
-        if kind is float and not math.isfinite(item):
-            if math.isnan(item) and self.may_be_nan:
-                return item
-            raise self._error(whole)
-        below = self.minimum is not None and item < self.minimum
-        above = self.maximum is not None and item > self.maximum
-        if kind in (int, float) and (below or above):
+        fits = type(item) is kind and not _is_large(item) and (not self.choices or item in self.choices)
+        if fits and self.form:
+            fits = self.form.fits(item)
+        elif fits and kind is float and not math.isfinite(item):
+            fits = math.isnan(item) and self.may_be_nan
+        elif fits and kind in (int, float):
+            low, high = self.minimum, self.maximum
+            fits = (low is None or item >= low) and (high is None or item <= high)
+        if not fits:
             raise self._error(whole)
         return item
 

@@ -13,9 +13,7 @@ from starpos.messages.camera import ExposureFacts, check_stamp, message_to_frame
 from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
 from starpos.messages.tilt import ImuTilts, Reading
 from starpos.parameters.given import values_of
-from starpos.recording.topics import IMAGE, NO_REMAPS, PICTURE, Remaps
-
-IMAGES = (IMAGE, PICTURE)
+from starpos.recording.topics import IMAGE, NO_REMAPS, Remaps
 
 
 @dataclass(frozen=True)

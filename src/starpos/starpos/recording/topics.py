@@ -12,12 +12,13 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 IMAGE, PICTURE, IMU = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "Imu"))
+IMAGES = (IMAGE, PICTURE)
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TILT, CAPTURE = f"{PACKAGE}/msg/Tilt", f"{PACKAGE}/msg/Capture"
 RAW, IMU_DATA = "camera/image_raw", "imu/data"
 # what each input may be, the preferred type first
 DRIVER_INPUTS = {
-    RAW: (IMAGE, PICTURE),
+    RAW: IMAGES,
     "camera/camera_info": (CAMERA_INFO,),
     "camera/capture": (CAPTURE,),
     "tilt": (TILT,),
@@ -103,6 +104,8 @@ def sentence_on_use(found: Mapping[str, str], connections: "Sequence[Connection]
 
 
 STARS, TRAILS, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "TrailArray", "Solution"))
+# of which each message is a frame
+FRAMES = (STARS, *IMAGES)
 # types by the relative names of the solver's inputs
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}

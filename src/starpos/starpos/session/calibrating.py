@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from types import coroutine
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from starpos.identification import Identification
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
 from starpos.instrument.tilt_log import TiltLog, TiltsByTime
+from starpos.session.camera_solver import CameraSolver
 from starpos.session.driver import Diagnosis, Jobs, Level, Log, Outcome
 from starpos.session.settings import Settings
 from starpos.session.standing import Averaging, News
@@ -56,11 +58,6 @@ class _Pose:
     frames: int = 0
     tilts: deque[Tilt] = field(default_factory=lambda: deque(maxlen=MAX_TILTS))
 
-    def keep(self, seen: Seen) -> None:
-        self.newest = seen
-        self.frames += 1
-        self.tilts.append(seen.tilt)
-
 
 class PoseMemory(deque[_Pose]):
     """Keeps each pose's last frame with the mean tilt of the pose; drops the oldest poses."""
@@ -73,7 +70,9 @@ class PoseMemory(deque[_Pose]):
         if not self or slip_s(fix.camera, self[-1].first.camera, fix.latitude) != 0:
             self.append(_Pose(fix, seen))
         pose = self[-1]
-        pose.keep(seen)
+        pose.newest = seen
+        pose.frames += 1
+        pose.tilts.append(seen.tilt)
         return pose.frames & (pose.frames - 1) == 0
 
     def frames(self) -> list[Seen]:
@@ -99,14 +98,13 @@ def mean_tilt(tilts: Sequence[Tilt]) -> Tilt:
     return replace(mean, samples=sum(t.samples for t in tilts), step_rad=max(t.step_rad for t in tilts))
 
 
-def tilts_of(seen: Sequence[Seen]) -> TiltsByTime:
-    """The tilts of frames, as a solver takes them."""
-    return TiltsByTime({s.mid_unix_s: s.tilt for s in seen})
-
-
-def known_of(seen: Sequence[Seen]) -> dict[int, Identification]:
-    """Identifications of the frames' stars, by the frames' numbers."""
-    return {k: s.found for k, s in enumerate(seen) if s.found is not None}
+def arguments_of(seen: Sequence[Seen]) -> dict[str, Any]:
+    """Frames as a calibration takes them: lists of stars, tilts by time, identifications by the frames' numbers."""
+    return {
+        "frames": [s.stars for s in seen],
+        "tilts": TiltsByTime({s.mid_unix_s: s.tilt for s in seen}),
+        "known": {k: s.found for k, s in enumerate(seen) if s.found is not None},
+    }
 
 
 @dataclass(frozen=True)
@@ -119,9 +117,7 @@ class Turned:
 
 def turn_on_the_spot(solver: Solver, poses: list[Seen], turn_stddev_deg: float) -> Turned:
     """Calibrate from poses on the spot; FixError if they give no place, or more than one."""
-    calibrated = turn(
-        solver, [p.stars for p in poses], tilts_of(poses), turn_stddev_deg, known=known_of(poses)
-    )
+    calibrated = turn(solver, turn_stddev_deg=turn_stddev_deg, **arguments_of(poses))
     if not calibrated.fixes:
         raise FixError(f"no heading has a fix: {calibrated.solutions[0].message}")
     place = average(calibrated.fixes)
@@ -175,7 +171,7 @@ OF_AVERAGE = OF_MOUNTING | {
 class Calibrating:
     """Keeps the calibration from frames: `found`, None while the parameters' calibration holds.
 
-    solver: returns the solver in use, or raises an InstrumentError that says why there is no solver.
+    instrument: the camera and the solver in use.
     changed: called when `found` changes.
     """
 
@@ -183,14 +179,14 @@ class Calibrating:
         self,
         settings: Settings,
         jobs: Jobs,
-        solver: Callable[[], Solver],
+        instrument: CameraSolver,
         changed: Callable[[], None],
         log: Log,
     ) -> None:
         self.found: Calibration | None = None
         self.average = Averaging()
         self._log = log
-        self._settings, self._solver, self._changed = settings, solver, changed
+        self._settings, self._instrument, self._changed = settings, instrument, changed
         self._values = settings.values
         self._recent: deque[Seen] = deque(maxlen=self._values["calibration_frames"])
         self._poses = PoseMemory()
@@ -212,7 +208,16 @@ class Calibrating:
     @property
     def about(self) -> str:
         """A sentence about the calibration that was found; '' without one."""
-        return _about(self._calibrated) if self._calibrated else ""
+        if (found := self._calibrated) is None:
+            return ""
+        c = found.instrument.calibration
+        without = sum(s.fix is None for s in found.solutions)
+        left_out = f", {without} more had no fix" if without else ""
+        rx, ry, rz = c.misalignment_deg
+        return (
+            f"A3 of {c.frames} frames is {rx:.5f} {ry:.5f} {rz:.5f} deg{left_out}; the plumb line in the camera is known "
+            f"to {found.plumb_stddev_arcsec:.2f} arcsec; {at_another_lean(c)}"
+        )
 
     @property
     def unknown(self) -> bool:
@@ -223,28 +228,25 @@ class Calibrating:
 
     def include(self, seen: Seen, fix: Fix | None) -> Average | None:
         """Keep a frame, and average its fix; return the average if it includes this frame."""
-        return self.average.place if self._included(seen, fix) else None
-
-    def _included(self, seen: Seen, fix: Fix | None) -> bool:
         mid = seen.mid_unix_s
         if mid == self._newest_unix_s or self._came_late(mid):
-            return False
+            return None
         self._newest_unix_s = mid
         if len(seen.stars):
             self._recent.append(seen)
         if fix is None:
-            return False
+            return None
         news = self.average.include(fix)
         # While A3 is not known, turning looks like moving.
         if self._calibrated and news is News.MOVED:
             self._era += 1
             self._poses.forget_before(self.average.began_unix_s)
         if self._calibrated and news is News.LEFT_OUT:
-            return False
+            return None
         worthwhile = self._poses.keep(seen, fix)
         if self._values["self_calibration"] and (worthwhile or self._again):
             self._turn_by_itself()
-        return news is not News.LEFT_OUT
+        return None if news is News.LEFT_OUT else self.average.place
 
     def _came_late(self, mid_unix_s: float) -> bool:
         """Whether a frame is older than an earlier one; after several such frames time has started again: forget all."""
@@ -257,11 +259,6 @@ class Calibrating:
             return True
         self.forget()
         return False
-
-    def _moved_on(self, since_unix_s: float) -> None:
-        self._era += 1
-        self._poses.forget_before(since_unix_s)
-        self.average.begin_anew()
 
     def forget(self) -> None:
         """Forget the frames and the place, but not the calibration from them."""
@@ -327,11 +324,10 @@ class Calibrating:
             raise FixError(
                 f"only {len(frames)}{asked} frames with stars and a tilt have arrived: wait for more, or ask for fewer"
             )
-        solver = self._solver()
+        solver = self._instrument.solver_now
         site = Place.by_gravity(latitude, longitude)
-        turn_deg = self._values["calibration_turn_stddev"]
-        stars, tilts, known = [f.stars for f in frames], tilts_of(frames), known_of(frames)
-        return lambda: calibrate_at(solver, stars, tilts, site, turn_stddev_deg=turn_deg, known=known)
+        turn_deg, given = self._values["calibration_turn_stddev"], arguments_of(frames)
+        return lambda: calibrate_at(solver, site=site, turn_stddev_deg=turn_deg, **given)
 
     # turning on the spot ---------------------------------------------------------------------------------------------
 
@@ -353,7 +349,7 @@ class Calibrating:
                 f"the instrument has stood at {_headings(len(poses))} here: turn it on the spot, to "
                 f"{MIN_HEADINGS} headings or more"
             )
-        solver = self._solver()
+        solver = self._instrument.solver_now
         turn_deg = self._values["calibration_turn_stddev"]
         return lambda: turn_on_the_spot(solver, poses, turn_deg)
 
@@ -382,7 +378,9 @@ class Calibrating:
                 self._adopt_turned(outcome.value)
             elif outcome.trouble and self._calibrated:
                 # The newest heading does not fit the others: the place has changed.
-                self._moved_on(self._newest_unix_s)
+                self._era += 1
+                self._poses.forget_before(self._newest_unix_s)
+                self.average.begin_anew()
         if self._again:
             self._turn_by_itself()
 
@@ -460,17 +458,6 @@ def _until(done: Callable[[], bool]) -> Iterator[None]:
     """Wait in a coroutine of the node, which its executor resumes again and again."""
     while not done():
         yield
-
-
-def _about(found: Calibrated) -> str:
-    c = found.instrument.calibration
-    without = sum(s.fix is None for s in found.solutions)
-    left_out = f", {without} more had no fix" if without else ""
-    rx, ry, rz = c.misalignment_deg
-    return (
-        f"A3 of {c.frames} frames is {rx:.5f} {ry:.5f} {rz:.5f} deg{left_out}; the plumb line in the camera is known to "
-        f"{found.plumb_stddev_arcsec:.2f} arcsec; {at_another_lean(c)}"
-    )
 
 
 def _headings(count: int) -> str:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from starpos.fix.solution import Solution
     from starpos.gnss.watch import GnssCheck
     from starpos.satellites.locating import SatelliteFix
+    from starpos.satellites.trails import SatelliteTrail
 
 # Times that differ by more are not of the same evening.
 ANOTHER_TIME_S = 3600.0
@@ -75,6 +76,7 @@ class Answered:
     no_camera: no camera calibration has arrived.
     attitude: the camera's, by its stars; None if they do not determine it.
     compared: the GNSS place at the frame, and what the guard says of it; None without one.
+    average: of the fixes here, after this one was added to it; None where it does not include this one.
     """
 
     stamp: Any
@@ -83,36 +85,32 @@ class Answered:
     no_camera: bool
     attitude: "CameraAttitude | None" = None
     compared: "GnssCheck | None" = None
+    average: "Average | None" = None
 
 
-@dataclass(frozen=True)
-class Averaged:
-    """The average after a frame was added to it, with the stamp of that frame's message."""
+@dataclass(frozen=True, kw_only=True)
+class Located:
+    """The place by the satellites' trails on the last frames, or why it is missing, and a sentence on what is left out.
 
-    stamp: Any
-    place: "Average"
-    ground: "Geodetic"
-
-
-@dataclass(frozen=True)
-class BySatellites:
-    """The place by the satellites on the last frames, None where they give none; with the stamp of the newest."""
+    stamp: of the newest frame.
+    """
 
     stamp: Any
-    fix: "SatelliteFix | None"
+    trails: "tuple[SatelliteTrail, ...]"
+    fix: "SatelliteFix | None" = None
+    why: str = ""
+    left_out: str = ""
 
 
-Output = Answered | Averaged | BySatellites
+Output = Answered | Located
 
 
 class Log(Protocol):
-    """Takes sentences, as rclpy's logger does; of an error, which is a defect, the traceback."""
+    """Takes sentences, as rclpy's logger does."""
 
     def info(self, message: str) -> object: ...
 
     def warning(self, message: str) -> object: ...
-
-    def error(self, message: str) -> object: ...
 
 
 class Changes:
@@ -135,8 +133,10 @@ class Changes:
         return True
 
 
-class Heard(Protocol):
-    """Keeps account of the messages, by the relative name of their topic."""
+class Driver(Log, Protocol):
+    """Whoever drives a session: a log, also of defects' tracebacks, and an account of messages by their topics' names."""
+
+    def error(self, message: str) -> object: ...
 
     def came(self, name: str) -> object: ...
 
@@ -144,14 +144,14 @@ class Heard(Protocol):
 
 
 @contextmanager
-def refusing(heard: Heard, name: str) -> Iterator[None]:
+def refusing(driver: Driver, name: str) -> Iterator[None]:
     """Refuse a message of a topic with the reason where the block raises a StarposError, else note that it came."""
     try:
         yield
     except StarposError as error:
-        heard.refuse(name, str(error))
+        driver.refuse(name, str(error))
     else:
-        heard.came(name)
+        driver.came(name)
 
 
 class Level(IntEnum):

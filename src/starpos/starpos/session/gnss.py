@@ -28,10 +28,9 @@ from starpos.instrument.instrument import Instrument
 from starpos.session.driver import (
     ANOTHER_TIME_S,
     Diagnosis,
-    Heard,
+    Driver,
     Jobs,
     Level,
-    Log,
     Now,
     outcome_of,
     refusing,
@@ -65,9 +64,6 @@ class RecentPlaces:
     def __init__(self, unstated_m: float = math.nan) -> None:
         self._unstated_m = unstated_m
         self._places: list[Place] = []
-
-    def __len__(self) -> int:
-        return len(self._places)
 
     @property
     def newest(self) -> Place | None:
@@ -154,20 +150,14 @@ class GnssTeacher:
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        jobs: Jobs,
-        heard: Heard,
-        log: Log,
-        satellites: "LiveSatellites | None" = None,
+        self, settings: Settings, jobs: Jobs, driver: Driver, satellites: "LiveSatellites | None" = None
     ) -> None:
         self.newest: Watched | None = None
-        self._settings, self._values, self._jobs = settings, settings.values, jobs
-        self._heard, self._log = heard, log
+        self._settings, self._values = settings, settings.values
+        self._jobs, self._driver = jobs, driver
         self.places, self._satellites = RecentPlaces(), satellites
         self._watch: GnssWatch | None = None
         self._instrument: Instrument | None = None
-        self._stored: Learned | None = settings.learned
         self._saved_s = -math.inf
         # what the file holds
         self._saved = settings.learned
@@ -176,11 +166,11 @@ class GnssTeacher:
     @property
     def learned(self) -> Learned | None:
         """What is known of the instrument now."""
-        return self._stored if self._watch is None else self._watch.learned
+        return self._settings.learned if self._watch is None else self._watch.learned
 
     def receive(self, message: Any, now: Now) -> None:
         """Keep the place of a sensor_msgs/NavSatFix; one that cannot be used is refused with the reason."""
-        with refusing(self._heard, GNSS_TOPIC):
+        with refusing(self._driver, GNSS_TOPIC):
             self.places.receive(message, now)
 
     def solve(self, solver: Solver, stars: Stars, rough: Solution, compared: bool = True) -> Watched:
@@ -198,11 +188,11 @@ class GnssTeacher:
         """The watch of an instrument; a new one where A3 or the inclinometer is stated otherwise."""
         before = self._instrument
         if self._watch is None:
-            self._watch = GnssWatch(instrument, self._settings.vertical, self._stored)
+            self._watch = GnssWatch(instrument, self._settings.vertical, self._settings.learned)
         elif before is not None and (
             before.calibration != instrument.calibration or before.inclinometer != instrument.inclinometer
         ):
-            self._log.warning(
+            self._driver.warning(
                 "another A3 or inclinometer is stated: what GNSS taught of the other is forgotten"
             )
             self._watch = GnssWatch(instrument, self._settings.vertical)
@@ -212,7 +202,7 @@ class GnssTeacher:
     def other_camera(self) -> None:
         """Forget what was learned of the other camera."""
         if self._watch is not None and self._instrument is not None:
-            self._log.warning("another camera_info: what GNSS taught of the other camera is forgotten")
+            self._driver.warning("another camera_info: what GNSS taught of the other camera is forgotten")
             self._watch = GnssWatch(self._instrument, self._settings.vertical)
 
     def _compared_with(self, stars: Stars, rough: Solution) -> Place | None:
@@ -221,7 +211,7 @@ class GnssTeacher:
         try:
             place = self.places.at(stars.mid_unix_s)
         except GnssError as error:
-            self._heard.refuse(GNSS_TOPIC, str(error))
+            self._driver.refuse(GNSS_TOPIC, str(error))
             return None
         if place is None and self._satellites is not None and rough.fix is not None:
             return self._satellites.teaching(stars.mid_unix_s)
@@ -239,7 +229,7 @@ class GnssTeacher:
     def close(self) -> None:
         """Write what was learned, at the end."""
         if self._worth_saving:
-            self._note(outcome_of(self._saving(), self._log.error).trouble)
+            self._note(outcome_of(self._saving(), self._driver.error).trouble)
 
     def _saving(self) -> Callable[[], None]:
         path, learned = path_of(self._values["gnss.learned"]), self.learned
@@ -257,7 +247,7 @@ class GnssTeacher:
 
     def _note(self, trouble: str) -> None:
         if trouble and trouble != self._trouble:
-            self._log.warning(trouble)
+            self._driver.warning(trouble)
         self._trouble = trouble
 
     # diagnostics -----------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.identification import Identification, PointingPrior
 from starpos.navigation.records import ImuModel
-from starpos.session.driver import Heard, Now
+from starpos.session.driver import Driver, Now
 
 if TYPE_CHECKING:
     from starpos.session.gyro_readings import GyroReadings
@@ -38,8 +38,8 @@ class Gyro:
     pair of attitudes improves the bias.
     """
 
-    def __init__(self, heard: Heard) -> None:
-        self._heard = heard
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
         self._readings: GyroReadings | None = None
         self.forget()
 
@@ -64,39 +64,35 @@ class Gyro:
             self._readings = GyroReadings()
         try:
             self._readings.receive(message)
-            self._heard.came(IMU_TOPIC)
+            self._driver.came(IMU_TOPIC)
         except VoyageError as e:
-            self._heard.refuse(IMU_TOPIC, str(e))
+            self._driver.refuse(IMU_TOPIC, str(e))
 
     def predicted(self, stars: Stars, solver: Solver | None) -> tuple[PointingPrior, ...]:
         """The attitude of a frame whose stars are to be identified; () where it would be of no use."""
         mid_s = stars.mid_unix_s
-        turned = None if solver is None or mid_s is None else self._turned(mid_s, solver)
-        if turned is None or mid_s is None:
+        if solver is None or mid_s is None or (turned := self._turned(mid_s, solver)) is None:
             return ()
-        useful = self._error(turned, mid_s) < turned.reach_rad(stars.width, stars.height)
-        return (turned,) if useful else ()
+        prior, error = turned
+        return (prior,) if error < prior.reach_rad(stars.width, stars.height) else ()
 
     def learn_from(self, stars: Stars, found: Identification, solver: Solver) -> None:
         """Take an attitude from stars identified beyond doubt, and learn the bias from it."""
         mid_s, (camera, _, _) = stars.mid_unix_s, solver.view(stars.width, stars.height)
         if mid_s is None:
             return
-        seen, turned = (
-            PointingPrior(found.attitude, camera.fx * found.focal_scale),
-            self._turned(mid_s, solver),
-        )
-        if turned is not None:
-            off = rotation.to_vector(seen.attitude @ turned.attitude.T)
-            error = math.hypot(self._error(turned, mid_s), STARS_RAD)
-            self._learn(_link(solver).T @ off, error, mid_s - self._seen_s)
+        seen = PointingPrior(found.attitude, camera.fx * found.focal_scale)
+        if (turned := self._turned(mid_s, solver)) is not None:
+            prior, error = turned
+            off = rotation.to_vector(seen.attitude @ prior.attitude.T)
+            self._learn(_link(solver).T @ off, math.hypot(error, STARS_RAD), mid_s - self._seen_s)
         self._seen, self._seen_s = seen, mid_s
 
     def _learn(self, off: np.ndarray, error: float, since_s: float) -> None:
         """Learn the bias from the gyro's error (3,), rad along its axes, after a time, and the sigma of this error."""
         if np.linalg.norm(off) > CONTRADICTION * error:
             degrees = math.degrees(np.linalg.norm(off))
-            self._heard.refuse(
+            self._driver.refuse(
                 IMU_TOPIC,
                 f"the gyro is {degrees:.3g} deg off the stars after {since_s:.3g} s: give rad/s along the axes that "
                 "calibration_url's link_to_camera turns into the camera's",
@@ -107,24 +103,20 @@ class Gyro:
         self._bias = self._bias + share * off / since_s
         self._bias_stddev = max(self._bias_stddev * math.sqrt(1 - share), MIN_BIAS_STDDEV)
 
-    def _turned(self, mid_s: float, solver: Solver) -> PointingPrior | None:
-        """The last attitude, turned on to a time; None without one, or where readings lack."""
-        if self._seen is None or self._readings is None:
+    def _turned(self, mid_s: float, solver: Solver) -> tuple[PointingPrior, float] | None:
+        """The last attitude, turned on to a time, and its error, one sigma an axis (rad); None where readings lack."""
+        seen = self._seen
+        if seen is None or self._readings is None:
             return None
         turn = self._readings.turn(self._seen_s, mid_s, MAX_MISSING_S, self._bias)
         if turn is None:
             return None
-        link = _link(solver)
-        return PointingPrior(link @ turn.T @ link.T @ self._seen.attitude, self._seen.focal_px)
-
-    def _error(self, turned: PointingPrior, mid_s: float) -> float:
-        """One sigma an axis, rad, of the attitude that is turned on to a time."""
-        assert self._seen is not None
-        since_s = mid_s - self._seen_s
-        angle = float(np.linalg.norm(rotation.to_vector(turned.attitude @ self._seen.attitude.T)))
+        link, since_s = _link(solver), mid_s - self._seen_s
+        turned = PointingPrior(link @ turn.T @ link.T @ seen.attitude, seen.focal_px)
+        angle = float(np.linalg.norm(rotation.to_vector(turned.attitude @ seen.attitude.T)))
         shares = math.hypot(WORST.scale_stddev, WORST.axes_stddev, MOUNT_RAD)
         noise = WORST.gyroscope_noise_density * math.sqrt(since_s)
-        return math.hypot(noise, self._bias_stddev * since_s, shares * angle)
+        return turned, math.hypot(noise, self._bias_stddev * since_s, shares * angle)
 
 
 def _link(solver: Solver) -> np.ndarray:

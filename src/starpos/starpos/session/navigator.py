@@ -28,7 +28,7 @@ from starpos.navigation.records import ImuModel, read_imu_model
 from starpos.navigation.sightings import PlacelessFrame, SunFrame, body_attitude
 from starpos.navigation.vessel import PARKED, Vessel
 from starpos.navigation.voyage import MIN_FRAMES, Voyage
-from starpos.session.driver import Changes, Diagnosis, Heard, Jobs, Level, Log, Now, Outcome, refusing
+from starpos.session.driver import Changes, Diagnosis, Driver, Jobs, Level, Now, Outcome, refusing
 from starpos.session.gnss import OLDEST_S, ComparedPlaces, contradiction
 from starpos.session.reports import AHEAD_S
 from starpos.session.settings import MIN_CLOCK_S, NodeSettings
@@ -81,7 +81,7 @@ APART = "all frames with stars are stamped later than the IMU's readings: set th
 class Navigated:
     """An output at one time: a fix, the place on the ellipsoid, where it lies from the origin; None without support.
 
-    displacement (3,): m east, north, up of the first place that was known to WIDE_M, along the axes there; with its
+    displacement (3,): m east, north, up of the first place that was known to WIDE_M, along the axes there; and its
     covariance (3, 3).
     at_place: heading, pitch and roll at a known place, while there is no fix; None where no place is known.
     """
@@ -89,23 +89,19 @@ class Navigated:
     utc_unix_s: float
     fix: VoyageFix | None = None
     ground: Geodetic | None = None
-    displacement: np.ndarray | None = None
-    displacement_covariance: np.ndarray | None = None
+    displacement: tuple[np.ndarray, np.ndarray] | None = None
     at_place: Attitude | None = None
 
 
 class NavigatorSession:
-    """Messages of an IMU, a camera's attitudes and velocities to places under way.
+    """Messages of an IMU, a camera's attitudes and velocities to places under way; jobs: runs the adjustment."""
 
-    jobs: makes the runner of the adjustment.
-    """
-
-    def __init__(self, settings: NavigatorSettings, jobs: Callable[[], Jobs], heard: Heard, log: Log) -> None:
+    def __init__(self, settings: NavigatorSettings, jobs: Jobs, driver: Driver) -> None:
         self.counts = {"adjustments": 0, "fixes": 0}
         self._settings, self._values = settings, settings.values
-        self._heard, self._log = heard, log
-        self._jobs = jobs()
-        self._changes = Changes(log)
+        self._driver = driver
+        self._jobs = jobs
+        self._changes = Changes(driver)
         self.reset()
 
     def reset(self) -> None:
@@ -125,11 +121,6 @@ class NavigatorSession:
         self._gnss = ComparedPlaces()
         self._jobs.disown()
 
-    @property
-    def busy(self) -> bool:
-        """Whether an adjustment runs."""
-        return self._jobs.busy
-
     def parameters_set(self) -> None:
         """Adjust anew with other parameters as soon as may be."""
         self._adjusted_s = -math.inf
@@ -141,7 +132,7 @@ class NavigatorSession:
         w, f, stamp = message.angular_velocity, message.linear_acceleration, message.header.stamp
         row = (stamp.sec + stamp.nanosec * 1e-9, w.x, w.y, w.z, f.x, f.y, f.z)
         due = False
-        with refusing(self._heard, "imu/data"):
+        with refusing(self._driver, "imu/data"):
             if (
                 message.angular_velocity_covariance[0] == -1
                 or message.linear_acceleration_covariance[0] == -1
@@ -150,7 +141,7 @@ class NavigatorSession:
                     "the IMU says by a covariance of -1 that it measures no rates or no accelerations: use "
                     "one that does"
                 )
-            self._check_time(row[0], now, "an inertial reading")
+            self._checked(row[0], now, "an inertial reading")
             self._begin_anew(row[0])
             self._recent.readings.append(row)
             due = row[0] >= self._next_s
@@ -158,15 +149,15 @@ class NavigatorSession:
 
     def receive_attitude(self, message: Any, now: Now) -> list[Navigated]:
         """Take a starpos_interfaces/Attitude."""
-        with refusing(self._heard, "attitude"):
+        with refusing(self._driver, "attitude"):
             attitude = message_to_attitude(message)
-            self._check_time(attitude.utc_unix_s, now, "an attitude")
+            time_s = self._checked(attitude.utc_unix_s, now, "an attitude")
             # If the user sets clock_stddev, it replaces the error that the camera's host states.
             if not np.isnan(self._values["clock_stddev"]):
                 attitude = replace(attitude, clock_stddev_s=0.0)
             by_sun, place = attitude.ray is not None, None
             if by_sun or self._estimate is None or self._stars_missing:
-                place = self._place_at(attitude.utc_unix_s)
+                place = self._place_at(time_s)
             if by_sun and place is None:
                 raise VoyageError(
                     "the Sun gives a heading only at a known place: set site.latitude and site.longitude, or gnss.use "
@@ -187,7 +178,7 @@ class NavigatorSession:
         try:
             gnss = self._gnss.at(utc_unix_s)
         except GnssError as e:
-            self._heard.refuse("gnss/fix", str(e))
+            self._driver.refuse("gnss/fix", str(e))
             return None
         return None if gnss is None else gnss.deflected(self._settings.vertical)
 
@@ -195,10 +186,8 @@ class NavigatorSession:
         """Take a nav_msgs/Odometry or a geometry_msgs/TwistWithCovarianceStamped, from the topic of that name."""
         v = message.twist.twist.linear
         variance = np.asarray(message.twist.covariance, float)[[0, 7, 14]]
-        with refusing(self._heard, name):
-            time_s = stamp_to_unix(message.header.stamp)
-            self._check_time(time_s, now, "a velocity")
-            assert time_s is not None
+        with refusing(self._driver, name):
+            time_s = self._checked(stamp_to_unix(message.header.stamp), now, "a velocity")
             if not variance.min() >= 0:
                 raise VoyageError(
                     "a velocity's variance is NaN or below 0: state it, or zeros for velocity_stddev"
@@ -211,10 +200,11 @@ class NavigatorSession:
     def receive_gnss(self, message: Any, now: Now) -> list[Navigated]:
         """Take a sensor_msgs/NavSatFix of satellites: it is compared, not fused."""
         self._gnss.receive(message, now)
-        self._heard.came("gnss/fix")
+        self._driver.came("gnss/fix")
         return []
 
-    def _check_time(self, unix_s: float | None, now: Now, what: str) -> None:
+    def _checked(self, unix_s: float | None, now: Now, what: str) -> float:
+        """The time of a message; VoyageError without one, or for one in the future."""
         if not unix_s:
             raise VoyageError(f"{what} has no time stamp: set header.stamp to when it was measured")
         if now.ahead_s(unix_s) > AHEAD_S:
@@ -222,12 +212,13 @@ class NavigatorSession:
                 f"{what} is stamped {now.ahead_s(unix_s):.3g} s in the future: set the clocks of camera, IMU and "
                 "navigator by one source"
             )
+        return unix_s
 
     def _begin_anew(self, time_s: float) -> None:
         """Begin a new voyage where an IMU was away or its clock was set: what happened meanwhile is not known."""
         away_s = time_s - self._recent.readings.last_s
         if math.isfinite(away_s) and (away_s > LONGEST_GAP_S or away_s < -BACK_S):
-            self._log.warning(
+            self._driver.warning(
                 f"the IMU's stamps {'jump by' if away_s > 0 else 'go back by'} {abs(away_s):.3g} s: begun anew"
             )
             self.reset()
@@ -270,7 +261,8 @@ class NavigatorSession:
         found: Voyage = made.value
         self._faults, self._sun = found.faults, sun
         self._seen_s = found.last.utc_unix_s
-        self._sigma_m, self._missing = observability(found.last, self._is_measured)
+        is_measured = bool(self._recent.velocities) or self._values["vehicle"] == PARKED
+        self._sigma_m, self._missing = observability(found.last, is_measured)
         self._estimate = self._carried_on(found.last)
         self._changes.say("fixes are coming" if sun is None else "headings by the Sun are coming", good=True)
 
@@ -280,10 +272,6 @@ class NavigatorSession:
         if readings.closed_s <= estimate.utc_unix_s:
             return estimate
         return estimate.carried_on(readings.since(estimate.utc_unix_s), readings.closed_s)
-
-    @property
-    def _is_measured(self) -> bool:
-        return bool(self._recent.velocities) or self._values["vehicle"] == PARKED
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
@@ -298,25 +286,20 @@ class NavigatorSession:
         if self._sun is not None:
             return Navigated(utc_unix_s=time_s, at_place=self._sun.heading_by(estimate.fix.link))
         self.counts["fixes"] += 1
-        ground, (displacement, covariance) = (
-            estimate.fix.on_ground(self._settings.vertical),
-            self._displacement(estimate),
-        )
         return Navigated(
             utc_unix_s=time_s,
             fix=estimate.fix,
-            ground=ground,
-            displacement=displacement,
-            displacement_covariance=covariance,
+            ground=estimate.fix.on_ground(self._settings.vertical),
+            displacement=self._displacement(estimate),
         )
 
-    def _displacement(self, estimate: Estimate) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
+    def _displacement(self, estimate: Estimate) -> tuple[np.ndarray, np.ndarray] | None:
         """Where an estimate lies from the first place that was known well enough, with covariance; None before it."""
         place = estimate.motion.place[0]
         if self._origin is None and self._sigma_m < WIDE_M:
             self._origin = place
         if self._origin is None:
-            return None, None
+            return None
         axes = enu_at(self._origin)
         return axes @ (place - self._origin), axes @ estimate.covariance[PLACE, PLACE] @ axes.T
 

@@ -2,7 +2,7 @@
 """A recorded night through a session, as the nodes solve it when `replay` plays the bag to them."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,6 @@ from starpos.frames.frame import Stars
 from starpos.frames.reading import read_frame
 from starpos.frames.tables import TILTS
 from starpos.instrument import instrument_file
-from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
@@ -26,8 +25,8 @@ from starpos.night.opening import frames_in
 from starpos.night.reading import stars_of
 from starpos.recording import topics
 from starpos.recording.bag import BagReader
-from starpos.recording.drivers import IMAGES, DriverMessages, Drivers
-from starpos.session.driver import Answered, Averaged, Heard, JobsInTurn, Log, Now, Output
+from starpos.recording.drivers import DriverMessages, Drivers
+from starpos.session.driver import Answered, Driver, JobsInTurn, Now, Output
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings
 
@@ -43,16 +42,17 @@ class Replay:
     remarks: sentences on how a robot's own messages are used.
     """
 
-    def __init__(self, settings: Settings, heard: Heard, log: Log, drivers: Drivers | None = None) -> None:
+    def __init__(self, settings: Settings, driver: Driver, drivers: Drivers | None = None) -> None:
         self.frames = 0
         self.remarks: list[str] = []
         self._jobs: list[JobsInTurn] = []
-        self._heard, self._log = heard, log
+        self._driver = driver
         self._drivers = Drivers.of() if drivers is None else drivers
-        self.session = SolverSession(settings, self._new_jobs, heard, log)
+        self._messages = DriverMessages(self._drivers)
+        self.session = SolverSession(settings, self._new_jobs, driver)
 
     def _new_jobs(self) -> JobsInTurn:
-        self._jobs.append(JobsInTurn(self._log.error))
+        self._jobs.append(JobsInTurn(self._driver.error))
         return self._jobs[-1]
 
     def play(self, path: Path, namespace: str | None = None) -> Iterator[Output]:
@@ -60,62 +60,60 @@ class Replay:
 
         Raises BagError if the bag cannot be read, FrameError if neither an instrument nor a robot's images are in it.
         """
-        now_ns, messages = 0, DriverMessages(self._drivers)
         with BagReader(path, typed=True) as bag:
             chosen = topics.instrument_in(bag, namespace, self.session.inputs, self._drivers.remaps)
             if chosen.made:
                 self.remarks.append(chosen.made)
-            for connection, log_ns, message in bag.decoded(chosen.connections):
-                # Time never goes back, even if the times of a bag's messages do.
-                now_ns = max(now_ns, log_ns)
-                now = Now.in_data(now_ns * 1e-9)
-                yield from self._taken(connection.msgtype, message, messages, now)
-                yield from self._settled(now)
-        yield from self._ended(Now.in_data(now_ns * 1e-9))
-        self.remarks += messages.remarks()
+            decoded = bag.decoded(chosen.connections)
+            yield from self._played((log_ns * 1e-9, c.msgtype, message) for c, log_ns, message in decoded)
+        self.remarks += self._messages.remarks()
 
-    def play_lists(self, camera: Camera, stars: Sequence[Stars], tilts: TiltLog) -> Iterator[Output]:
-        """Yield what the solver publishes of lists of stars with times, and of tilts, each at its own time."""
-        self.session.instrument.use_known(camera)
-        messages: list[tuple[float, Any]] = [
-            (unix_s, _tilt_message(tilts, k)) for k, unix_s in enumerate(tilts.utc_unix_s.tolist())
+    def play_field(self, folder: Path) -> Iterator[Output]:
+        """Yield what the solver publishes of an unpacked field report, each list and tilt at its own time."""
+        instrument = instrument_file.read(folder / INSTRUMENT)
+        stars = [stars_of(read_frame(path)) for path in frames_in(folder)]
+        tilts = read_tilt_csv(folder / TILTS, instrument.inclinometer.noise_rad)
+        self.session.instrument.use_known(instrument.camera_for(stars[0].width, stars[0].height))
+        came: list[tuple[float, str, Any]] = [
+            (unix_s, topics.TILT, _tilt_message(tilts, k))
+            for k, unix_s in enumerate(tilts.utc_unix_s.tolist())
         ]
-        messages += [((s.mid_unix_s or 0.0) + (s.exposure_s or 0.0) / 2, s) for s in stars]
+        came += [((s.mid_unix_s or 0.0) + (s.exposure_s or 0.0) / 2, topics.STARS, s) for s in stars]
+        yield from self._played(sorted(came, key=lambda message: message[0]))
+
+    def _played(self, messages: Iterable[tuple[float, str, Any]]) -> Iterator[Output]:
+        """Take messages, each with its time and its type, one after another, and end."""
         now = Now.in_data(0.0)
-        for unix_s, message in sorted(messages, key=lambda m: m[0]):
-            now = Now.in_data(unix_s)
-            if isinstance(message, Stars):
-                self.frames += 1
-                stamp = PlainStamp.of_ns(round((message.mid_unix_s or 0.0) * 1e9))
-                yield from self.session.receive_detected(message, PlainHeader(stamp, "camera"), now)
-            else:
-                yield from self.session.receive(topics.TILT, message, now)
+        for unix_s, kind, message in messages:
+            # Time never goes back, even if the times of a bag's messages do.
+            now = Now.in_data(max(now.waiting_s, unix_s))
+            yield from self._taken(kind, message, now)
             yield from self._settled(now)
-        yield from self._ended(now)
-
-    def _taken(self, kind: str, message: Any, messages: DriverMessages, now: Now) -> list[Output]:
-        """Have the session take a message, or the stars or tilt made from it."""
-        session = self.session
-        self.frames += kind == topics.STARS or kind in IMAGES
-        if kind in IMAGES:
-            try:
-                stars, header = messages.stars_of(kind, message)
-            except StarposError as error:
-                self._heard.refuse("image_raw", str(error))
-                return []
-            return session.receive_detected(stars, header, now)
-        if kind == topics.CAPTURE:
-            messages.receive_capture(message)
-            return []
-        if kind == topics.IMU:
-            kind, message = topics.TILT, messages.tilt_of(message, now.unix_s or 0.0)
-        return [] if message is None else session.receive(kind, message, now)
-
-    def _ended(self, now: Now) -> Iterator[Output]:
         yield from self.session.end(now)
         while self.session.busy:
             yield from self._settled(now)
             yield from self.session.end(now)
+
+    def _taken(self, kind: str, message: Any, now: Now) -> list[Output]:
+        """Have the session take a message, or the stars or tilt made from it."""
+        session = self.session
+        self.frames += kind in topics.FRAMES
+        if isinstance(message, Stars):
+            stamp = PlainStamp.of_ns(round((message.mid_unix_s or 0.0) * 1e9))
+            return session.receive_detected(message, PlainHeader(stamp, "camera"), now)
+        if kind in topics.IMAGES:
+            try:
+                stars, header = self._messages.stars_of(kind, message)
+            except StarposError as error:
+                self._driver.refuse("image_raw", str(error))
+                return []
+            return session.receive_detected(stars, header, now)
+        if kind == topics.CAPTURE:
+            self._messages.receive_capture(message)
+            return []
+        if kind == topics.IMU:
+            kind, message = topics.TILT, self._messages.tilt_of(message, now.waiting_s)
+        return [] if message is None else session.receive(kind, message, now)
 
     def _settled(self, now: Now) -> Iterator[Output]:
         while self.session.busy:
@@ -212,23 +210,20 @@ class Playing:
             with opened(bag) as (folder, air):
                 told = self.given or self.params_file is not None
                 given = self.given if told else _parameters_in(folder, air)
-                return self._played(lambda replay: _play_field(replay, folder), given)
+                return self._played(lambda replay: replay.play_field(folder), given)
         return self._played(lambda replay: replay.play(Path(bag), self.namespace), self.given)
 
     def _played(self, play: Callable[[Replay], Iterator[Output]], given: Sequence[str]) -> PlayedNight:
         settings = Settings.of(self.params_file, given, self.namespace)
         night = PlayedNight(instrument=settings.instrument(None))
         said = _Said(night)
-        replay = Replay(
-            settings, said, said, Drivers.of(self.params_file, self.given, self.namespace, self.remaps)
-        )
+        replay = Replay(settings, said, Drivers.of(self.params_file, self.given, self.namespace, self.remaps))
         try:
             for output in play(replay):
                 if isinstance(output, Answered):
                     # without what only its solver needs
                     night.solutions.append(replace(output.solution, hint=None))
-                elif isinstance(output, Averaged):
-                    night.average = output.place
+                    night.average = output.average or night.average
                 else:
                     night.by_satellites = output.fix or night.by_satellites
         except StarposError as error:
@@ -243,14 +238,6 @@ def _parameters_in(folder: Path, air: Atmosphere) -> list[str]:
     measured = {"pressure": air.pressure_pa, "temperature": air.temperature_c, "humidity": air.humidity}
     refraction = [f"refraction.{name}:={float(value)}" for name, value in measured.items()]
     return [f"calibration_url:={folder / INSTRUMENT}", *refraction]
-
-
-def _play_field(replay: Replay, folder: Path) -> Iterator[Output]:
-    """What the session publishes of an unpacked field report."""
-    instrument = instrument_file.read(folder / INSTRUMENT)
-    stars = [stars_of(read_frame(path)) for path in frames_in(folder)]
-    tilts = read_tilt_csv(folder / TILTS, instrument.inclinometer.noise_rad)
-    return replay.play_lists(instrument.camera_for(stars[0].width, stars[0].height), stars, tilts)
 
 
 def replay(

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,14 @@ from starpos.errors import SatelliteError, StarposError
 from starpos.fix.solution import Solution
 from starpos.frames.frame import FrameTrail, Stars
 from starpos.gnss.receiver import gnss_place
+from starpos.messages.stamp import stamp_to_ns
 from starpos.messages.stars import message_to_trails
 from starpos.satellites.adjustment import KnownBefore
 from starpos.satellites.elements import StoredOrbits, chosen
 from starpos.satellites.frames import FrameSky
-from starpos.satellites.locating import SatelliteFix, locate
+from starpos.satellites.locating import locate
 from starpos.satellites.trails import SatelliteTrail
-from starpos.session.driver import BySatellites, Diagnosis, Heard, Jobs, Level, Output, refusing
+from starpos.session.driver import Diagnosis, Driver, Jobs, Level, Located, refusing
 from starpos.session.settings import Settings
 from starpos.sky import catalogue
 
@@ -31,22 +32,11 @@ TEACHES = 40
 Frame = tuple[Any, Stars, Solution, list[FrameTrail]]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Located:
-    """Result of a job: the trails that count, the place or why it is missing, and a sentence on what is left out."""
-
-    stamp: Any
-    trails: tuple[SatelliteTrail, ...]
-    fix: SatelliteFix | None = None
-    why: str = ""
-    left_out: str = ""
-
-
 class LiveSatellites:
     """Collects trails of identified frames while satellites.elements is set; each frame with trails begins a job."""
 
-    def __init__(self, settings: Settings, orbits: StoredOrbits, jobs: Jobs, heard: Heard) -> None:
-        self._settings, self._orbits, self._jobs, self._heard = settings, orbits, jobs, heard
+    def __init__(self, settings: Settings, orbits: StoredOrbits, jobs: Jobs, driver: Driver) -> None:
+        self._settings, self._orbits, self._jobs, self._driver = settings, orbits, jobs, driver
         self._catalogue = catalogue.load_catalogue()
         self.forget()
 
@@ -55,9 +45,8 @@ class LiveSatellites:
         self._identified: dict[int, tuple[Stars, Solution]] = {}
         self._found: dict[int, tuple[Any, list[FrameTrail]]] = {}
         self._waiting: list[Frame] = []
-        self._trails: tuple[SatelliteTrail, ...] = ()
         self._newest: Located | None = None
-        self._made: list[Output] = []
+        self._made: list[Located] = []
         self._place: Place | None = None
         self._taught = 0
         self._jobs.disown()
@@ -65,17 +54,17 @@ class LiveSatellites:
     # what comes -------------------------------------------------------------------------------------------------------
 
     def receive(self, message: Any) -> None:
-        with refusing(self._heard, "trails"):
-            stamp = message.header.stamp
-            self._found[_ns(stamp)] = stamp, message_to_trails(message)
-            self._pair(_ns(stamp))
+        with refusing(self._driver, "trails"):
+            stamp, ns = message.header.stamp, stamp_to_ns(message.header.stamp)
+            self._found[ns] = stamp, message_to_trails(message)
+            self._pair(ns)
 
     def note(self, stamp: Any, stars: Stars, answer: Solution) -> None:
         """Take the stars of a frame, if they are identified."""
         if answer.found is not None and answer.pointing is not None:
             shutter = self._settings.instrument(None).shutter or stars.shutter
-            self._identified[_ns(stamp)] = replace(stars, shutter=shutter), answer
-            self._pair(_ns(stamp))
+            self._identified[stamp_to_ns(stamp)] = replace(stars, shutter=shutter), answer
+            self._pair(stamp_to_ns(stamp))
 
     def _pair(self, ns: int) -> None:
         if ns in self._identified and ns in self._found:
@@ -85,7 +74,7 @@ class LiveSatellites:
             while len(kept) > KEPT:
                 kept.pop(next(iter(kept)))
 
-    def fetch(self) -> list[Output]:
+    def fetch(self) -> list[Located]:
         """What was found since the last call; begins to look at frames that wait."""
         if self._waiting and not self._jobs.busy:
             self._begin()
@@ -93,7 +82,8 @@ class LiveSatellites:
         return made
 
     def _begin(self) -> None:
-        frames, trails, values = tuple(self._waiting), self._trails, self._settings.values
+        frames, values = tuple(self._waiting), self._settings.values
+        trails = () if self._newest is None else self._newest.trails
         self._waiting.clear()
         instrument = self._settings.instrument(None)
         # an error of the stamps may be the same in all frames
@@ -110,11 +100,10 @@ class LiveSatellites:
         )
 
     def _take(self, found: Located) -> None:
-        self._newest, self._trails = found, found.trails
-        self._made.append(BySatellites(found.stamp, found.fix))
-        if found.fix is not None:
+        self._newest = found
+        self._made.append(found)
+        if (fix := found.fix) is not None:
             utc_unix_s = float(found.trails[-1].utc_unix_s[0])
-            fix = found.fix
             self._place = gnss_place(utc_unix_s, fix.latitude, fix.longitude, fix.covariance[:2, :2])
 
     # what it is good for ----------------------------------------------------------------------------------------------
@@ -185,10 +174,9 @@ def located(
         else:
             trails += more
             left_out = why or left_out
-    stamp = frames[-1][0]
     begin = max((float(t.utc_unix_s[0]) for t in trails), default=0.0) - window_s
     kept = tuple(replace(t, track=k) for k, t in enumerate(t for t in trails if t.utc_unix_s[0] >= begin))
-    made = Located(stamp=stamp, trails=kept, left_out=left_out)
+    made = Located(stamp=frames[-1][0], trails=kept, left_out=left_out)
     if not kept:
         return replace(made, why="no trail shows an end of its exposure")
     try:
@@ -196,7 +184,3 @@ def located(
         return replace(made, fix=locate(kept, usable, prior))
     except SatelliteError as error:
         return replace(made, why=str(error))
-
-
-def _ns(stamp: Any) -> int:
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)

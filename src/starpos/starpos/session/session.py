@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from starpos.averaging.average import Average
 from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError
 from starpos.fix.attitude import CameraAttitude
@@ -33,7 +34,7 @@ from starpos.session import reports
 from starpos.session.calibrating import OF_AVERAGE, OF_MOUNTING, Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.deflection import LiveDeflection
-from starpos.session.driver import Answered, Averaged, Changes, Heard, Jobs, Log, Now, Output, Sent, refusing
+from starpos.session.driver import Answered, Changes, Driver, Jobs, Now, Output, Sent, refusing
 from starpos.session.gnss import GnssTeacher, SessionPlaces
 from starpos.session.gyro import Gyro
 from starpos.session.pace import MAX_WAITING, Backlog, Pace, Waiting
@@ -62,7 +63,7 @@ class SolverSession:
     """An instrument's messages to its solutions.
 
     jobs: makes the runner of long jobs; when an Outcome has come, call `at`.
-    arrived, arrived_stars: give the tilts, and the star lists, that have come but are not taken yet.
+    arrived: gives the messages of `tilt`, or of `stars`, that have come but are not taken yet.
     topic: full name of the topic of the camera's intrinsics, for sentences.
     """
 
@@ -70,11 +71,9 @@ class SolverSession:
         self,
         settings: Settings,
         jobs: Callable[[], Jobs],
-        heard: Heard,
-        log: Log,
+        driver: Driver,
         *,
-        arrived: Callable[[], Iterable[tuple[Any, Sent]]] = tuple,
-        arrived_stars: Callable[[], Iterable[tuple[Any, Sent]]] = tuple,
+        arrived: Callable[[str], Iterable[tuple[Any, Sent]]] = lambda name: (),
         topic: str = CAMERA_TOPIC,
     ) -> None:
         # the runners whose outcomes answers depend on
@@ -93,15 +92,15 @@ class SolverSession:
         self.tilts = TiltBuffer(settings)
         self.doubt = ClockDoubt()
         self._level = LevelDoubt()
-        self.gyro = Gyro(heard)
+        self.gyro = Gyro(driver)
         self.satellites: LiveSatellites | None = None
         if settings.orbits is not None:
             from starpos.session import satellites
 
-            self.satellites = satellites.LiveSatellites(settings, settings.orbits, waited_for(), heard)
+            self.satellites = satellites.LiveSatellites(settings, settings.orbits, waited_for(), driver)
         self.gnss: GnssTeacher | None = None
         if settings.values["gnss.use"]:
-            self.gnss = GnssTeacher(settings, jobs(), heard, log, self.satellites)
+            self.gnss = GnssTeacher(settings, jobs(), driver, self.satellites)
         self._take: dict[str, Take] = {
             CAMERA_INFO: self._take_camera,
             TILT: self._take_tilt,
@@ -119,14 +118,14 @@ class SolverSession:
         self._catalogue = catalogue.load_catalogue()
         # This reads the tables of the Earth's rotation, so that the first frame is not slow.
         earth_state(J2000_UNIX_S)
-        self._heard, self._log = heard, log
-        self._arrived, self._arrived_stars = arrived, arrived_stars
+        self._driver = driver
+        self._arrived = arrived
         self._backlog = Backlog()
         self._was_s: float | None = None
         self._ended = False
         # from the last fix
         self._hint: Hint | None = None
-        self._changes = Changes(log)
+        self._changes = Changes(driver)
         self.instrument = CameraSolver(
             self._make_solver,
             self._other_camera,
@@ -135,10 +134,10 @@ class SolverSession:
             topic,
         )
         self.calibrating = Calibrating(
-            settings, waited_for(), lambda: self.instrument.solver_now, self._other_calibration, log
+            settings, waited_for(), self.instrument, self._other_calibration, driver
         )
         if unnamed := unnamed_inclinometer(settings.instrument(None), MODEL_BY_PARAMETERS):
-            log.warning(unnamed)
+            driver.warning(unnamed)
 
     def _make_solver(self, camera: Camera) -> Solver:
         return self._settings.solver(camera, self.calibrating.found, self._catalogue)
@@ -154,6 +153,7 @@ class SolverSession:
             self.latest = replace(self.latest, refused=None)
 
     def _other_camera(self) -> None:
+        self._settings.camera = self.instrument.camera
         self._forget()
         self._search.other_camera()
         self._glows = Glows()
@@ -212,17 +212,17 @@ class SolverSession:
         return made + self._work(now)
 
     def _take_camera(self, message: Any, now: Now, sent: Sent) -> None:
-        with refusing(self._heard, "camera_info"):
+        with refusing(self._driver, "camera_info"):
             self.instrument.receive(message, at_once=not now.played)
 
     def _take_tilt(self, message: Any, now: Now, sent: Sent) -> None:
-        with refusing(self._heard, "tilt"):
+        with refusing(self._driver, "tilt"):
             self.tilts.receive(message, sent, now)
 
     def _take_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
         """Take a StarArray, and those that have come after it."""
         made = self._add_stars(message, now, sent)
-        for later, later_sent in self._arrived_stars():
+        for later, later_sent in self._arrived("stars"):
             made += self._add_stars(later, now, later_sent)
         return made
 
@@ -233,10 +233,9 @@ class SolverSession:
         try:
             stars = message_to_stars(message)
         except StarposError as e:
-            number = len(message.stars)
-            bad = Solution(Status.BAD_INPUT, str(e), source="stars", utc_unix_s=None, stars_detected=number)
+            bad = replace(Solution.unreadable("stars", e), stars_detected=len(message.stars))
             self._note(bad, now)
-            return [self._output(message.header.stamp, bad)]
+            return [self._output(message.header.stamp, Watched(solution=bad))]
         self._wait_for(stars, message.header, now)
         return []
 
@@ -249,7 +248,7 @@ class SolverSession:
 
     def _takes(self, header: Any, now: Now, sent: Sent) -> bool:
         """Whether a frame is wanted and can be answered in time."""
-        self._heard.came("stars")
+        self._driver.came("stars")
         if not now.played:
             self.pace.numbered(sent.number, now.waiting_s)
         if not self.pace.wants(stamp_to_unix(header.stamp), self._values["max_rate"]):
@@ -269,7 +268,7 @@ class SolverSession:
         self.instrument.note_frame_size(stars.width, stars.height, at_once=not now.played)
         if len(self._backlog) >= MAX_WAITING:
             self.pace.drop(now.waiting_s)
-            self._heard.refuse("stars", f"a frame was dropped: {MAX_WAITING} wait for their tilts")
+            self._driver.refuse("stars", f"a frame was dropped: {MAX_WAITING} wait for their tilts")
             return
         ahead_s = now.ahead_s(stars.mid_unix_s)
         self._backlog.append(Waiting(header=header, stars=stars, since_s=now.waiting_s, ahead_s=ahead_s))
@@ -309,13 +308,13 @@ class SolverSession:
             self.tilts.forget_publishers()
         if now.unix_s > was_s:
             for message in self.tilts.pop_early():
-                with refusing(self._heard, "tilt"):
+                with refusing(self._driver, "tilt"):
                     self.tilts.keep_in_time(message, now)
 
     def _work(self, now: Now) -> list[Output]:
         """Answer what can be answered, and have the trails of these frames looked at."""
         made = self._answers(now)
-        return made if self.satellites is None else made + self.satellites.fetch()
+        return made if self.satellites is None else [*made, *self.satellites.fetch()]
 
     def _answers(self, now: Now) -> list[Output]:
         """Answer the first frames that have everything they need: of recorded ones all, live one at a time."""
@@ -327,9 +326,9 @@ class SolverSession:
                 self.more = True
                 return made
             # After a stall the frame's own tilts may be among them.
-            for message, sent in self._arrived():
+            for message, sent in self._arrived("tilt"):
                 self._take_tilt(message, now, sent)
-            made += self._solve(self._backlog.take(now.waiting_s).dated(now), now)
+            made.append(self._solve(self._backlog.take(now.waiting_s).dated(now), now))
         self._backlog.pause()
         return made
 
@@ -354,7 +353,7 @@ class SolverSession:
             return True
         return self.tilts.complete(mid, frame.stars.exposure_s or 0.0)
 
-    def _solve(self, frame: Waiting, now: Now) -> list[Output]:
+    def _solve(self, frame: Waiting, now: Now) -> Answered:
         predicted: Priors = self._guarded(
             lambda: self.gyro.predicted(frame.stars, self.instrument.solver), lambda e: ()
         )
@@ -377,17 +376,15 @@ class SolverSession:
             self._guarded(
                 lambda: satellites.note(frame.header.stamp, frame.stars, answered.solution), lambda e: None
             )
-        return [
-            replace(answered, attitude=self._attitude(frame, question, answered.solution)),
-            *self._learn(frame, answered.solution),
-        ]
+        attitude = self._attitude(frame, question, answered.solution)
+        return replace(answered, attitude=attitude, average=self._learn(frame, answered.solution))
 
     def _guarded(self, work: Callable[[], T], instead: Callable[[Exception], T]) -> T:
         """What `work` makes.  A defect in it is logged and loses only that: the session goes on with `instead`."""
         try:
             return work()
         except Exception as e:
-            self._log.error(traceback.format_exc())
+            self._driver.error(traceback.format_exc())
             return instead(e)
 
     def _question(self, frame: Waiting, **known: Any) -> Question:
@@ -430,15 +427,14 @@ class SolverSession:
 
     def _taught(self, frame: Waiting, answer: Solution, compared: bool) -> Answered:
         """The answer to a frame, with gnss.use by what GNSS has taught; compared: with GNSS's place of its time too."""
-        stamp, solver, gnss = frame.header.stamp, self.instrument.solver, self.gnss
-        if gnss is None or solver is None or frame.refused is not None:
-            return self._output(stamp, answer)
-        taught = self._guarded(
-            lambda: gnss.solve(solver, frame.stars, answer, compared),
-            lambda e: Watched(solution=_failed(frame, "what GNSS taught could not be used on this frame", e)),
-        )
-        made = self._output(stamp, taught.solution)
-        return replace(made, ground=taught.ground, compared=taught.compared)
+        solver, gnss, taught = self.instrument.solver, self.gnss, Watched(solution=answer)
+        if gnss is not None and solver is not None and frame.refused is None:
+            why = "what GNSS taught could not be used on this frame"
+            taught = self._guarded(
+                lambda: gnss.solve(solver, frame.stars, answer, compared),
+                lambda e: Watched(solution=_failed(frame, why, e)),
+            )
+        return self._output(frame.header.stamp, taught)
 
     def _attitude(self, frame: Waiting, question: Question, answer: Solution) -> CameraAttitude | None:
         if (solver := self.instrument.solver) is None:
@@ -449,30 +445,27 @@ class SolverSession:
             lambda e: None,
         )
 
-    def _learn(self, frame: Waiting, answer: Solution) -> list[Output]:
+    def _learn(self, frame: Waiting, answer: Solution) -> Average | None:
         """Give a frame to the calibration and the average, even one that a stale calibration refuses.
 
         A frame whose time is in doubt is left out.  Returns the average if it includes the frame.
         """
         stars, solver = frame.stars, self.instrument.solver
         if solver is None or stars.mid_unix_s is None or frame.doubted:
-            return []
+            return None
         if answer.status is Status.BAD_INPUT and frame.ahead_s > reports.AHEAD_S:
-            return []
+            return None
         try:
             tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
             solver.instrument.inclinometer.check_live(tilt)
         except StarposError:
-            return []
+            return None
         self._guarded(lambda: self.deflection.include(solver, stars, tilt, answer.found), lambda e: None)
-        place = self._guarded(
+        return self._guarded(
             lambda: self.calibrating.include(Seen(stars, tilt, answer.found), answer.fix),
             # data that cause a defect must not stay
             lambda e: self.calibrating.forget(),
         )
-        if place is None:
-            return []
-        return [Averaged(frame.header.stamp, place, place.on_ground(self._settings.vertical))]
 
     def _note(self, answer: Solution, now: Now) -> None:
         """Note the answer to the newest frame."""
@@ -483,10 +476,14 @@ class SolverSession:
         if self.gnss is not None:
             self.gnss.save_if_due(now)
 
-    def _output(self, stamp: Any, answer: Solution) -> Answered:
+    def _output(self, stamp: Any, made: Watched) -> Answered:
         no_camera = self.instrument.solver is None and self.instrument.camera is None
-        ground = None if answer.fix is None else answer.fix.on_ground(self._settings.vertical)
-        return Answered(stamp=stamp, solution=answer, ground=ground, no_camera=no_camera)
+        solution, ground = made.solution, made.ground
+        if ground is None and solution.fix is not None:
+            ground = solution.fix.on_ground(self._settings.vertical)
+        return Answered(
+            stamp=stamp, solution=solution, ground=ground, no_camera=no_camera, compared=made.compared
+        )
 
     def solve_again(self) -> Answered | None:
         """Solve the newest frame with what is known now, identified anew whatever was found before; None without one.

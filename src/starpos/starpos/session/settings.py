@@ -39,7 +39,7 @@ class NodeSettings:
 
     A file is read once, when its parameter is checked, so the checked contents are used. A file that breaks or
     disappears later does not matter until the parameter is set again.
-    files: the contents by parameter.
+    files: the contents by parameter.  camera: the one in use, which an instrument file has to fit; None without one.
     """
 
     # a reader of files for a parameter that names one
@@ -50,16 +50,15 @@ class NodeSettings:
 
     def __init__(self, values: Mapping[str, Any], files: Mapping[str, Any] | None = None) -> None:
         self.values = values
+        self.camera: Camera | None = None
         self._files = {**dict.fromkeys(self.readers), **(files or {})}
         # by the last check
         self._read = self._files
 
-    def check(
-        self, values: Mapping[str, Any], names: frozenset[str], camera: Camera | None = None
-    ) -> str | None:
+    def check(self, values: Mapping[str, Any], names: frozenset[str]) -> str | None:
         """Say in a sentence why values cannot be together, such as with a broken file; None if they can.
 
-        names: of those that are set.  camera: the one in use, None before there is one.
+        names: of those that are set.
         """
         try:
             read = {
@@ -69,8 +68,8 @@ class NodeSettings:
             }
             wanted = type(self)(values, self._files | read)
             wanted.refuse()
-            if camera is not None and "calibration_url" in read:
-                wanted.check_camera(camera)
+            if self.camera is not None and "calibration_url" in read:
+                wanted.check_camera(self.camera)
         except StarposError as e:
             return str(e)
         self._read = wanted._files

@@ -46,8 +46,6 @@ class Averaging:
         self._turned: Average | None = None
         # The first fix of the present pose.
         self._pose: Fix | None = None
-        # Whether the fixes seem to be of another place than the turn.
-        self._elsewhere = False
         self._news = News.USED
         self._moved = 0
 
@@ -59,7 +57,8 @@ class Averaging:
     @property
     def place(self) -> Average | None:
         """The average place; None before the first fix."""
-        return self._averager.average if self._turned is None or self._elsewhere else self._turned
+        elsewhere = self._turned is None or self._news is News.LEFT_OUT
+        return self._averager.average if elsewhere else self._turned
 
     @property
     def began_unix_s(self) -> float:
@@ -83,11 +82,12 @@ class Averaging:
 
     def _judged(self, before: Average | None, after: Average) -> News:
         if self._turned is not None:
-            self._elsewhere = _sigmas_apart(after, self._turned) > ELSEWHERE_SIGMA
-            if self._elsewhere and after.frames >= MOVED_FIXES:
-                self._turned = None
-                return News.MOVED
-            return News.LEFT_OUT if self._elsewhere else News.USED
+            if _sigmas_apart(after, self._turned) <= ELSEWHERE_SIGMA:
+                return News.USED
+            if after.frames < MOVED_FIXES:
+                return News.LEFT_OUT
+            self._turned = None
+            return News.MOVED
         if before is None or after.moved == before.moved:
             return News.LEFT_OUT if before and after.left_out > before.left_out else News.USED
         return News.MOVED

@@ -103,7 +103,7 @@ def played(recorded, session, wanted):
         "refraction.temperature": 5.0,
         "refraction.humidity": 0.3,
     }
-    replay = Replay(Settings.of(None, [f"{k}:={v}" for k, v in values.items()]), Silent(), Silent())
+    replay = Replay(Settings.of(None, [f"{k}:={v}" for k, v in values.items()]), Silent())
     assert len(list(replay.play(recorded))) >= 8
     return replay.session.deflection
 

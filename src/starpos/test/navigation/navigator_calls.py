@@ -92,7 +92,7 @@ class Navigator:
         settings.adopt()
         self.told, self.outputs, self.works = Told(), [], True
         self._jobs = JobsInTurn(self.told.error)
-        self.session = NavigatorSession(settings, lambda: self._jobs, self.told, self.told)
+        self.session = NavigatorSession(settings, self._jobs, self.told)
 
     def play(self, events):
         """Pass (unix_s, take's name, arguments) in the order of time."""

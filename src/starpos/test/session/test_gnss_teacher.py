@@ -18,6 +18,8 @@ NORTH_3_KM = 0.027
 class Account:
     """Keeps which messages came and which were refused."""
 
+    info = warning = error = staticmethod(print)
+
     def __init__(self):
         self.taken, self.refused = 0, []
 
@@ -32,8 +34,7 @@ class Account:
 @pytest.fixture
 def teacher():
     account = Account()
-    log = SimpleNamespace(info=print, warning=print, error=print)
-    made = GnssTeacher(Settings.of(None, ("gnss.use:=true",)), JobsInTurn(print), account, log)
+    made = GnssTeacher(Settings.of(None, ("gnss.use:=true",)), JobsInTurn(print), account)
     made.account = account
     return made
 
@@ -94,7 +95,7 @@ def test_the_middle_of_an_exposure_has_its_place_whatever_the_receivers_rate(rat
     place = places.at(START_S + until - late_s)
     assert math.degrees(place.latitude) == pytest.approx(47.0 + 1e-6 * (until - late_s), abs=1e-8)
     assert places.at(START_S + 1.0) is None
-    assert len(places) <= 2 * KEPT_S * rate_hz + 1
+    assert len(places._places) <= 2 * KEPT_S * rate_hz + 1
 
 
 def test_two_receivers_on_one_topic_are_compared_with_nothing(teacher):

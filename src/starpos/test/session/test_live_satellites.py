@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from starpos.session.driver import JobsInTurn, Level
-from starpos.session.satellites import TEACHES, LiveSatellites, Located
+from starpos.session.driver import JobsInTurn, Level, Located
+from starpos.session.satellites import TEACHES, LiveSatellites
 from starpos.session.settings import Settings
 from starpos_testing.skies import orbits
 
@@ -72,7 +72,7 @@ def trail(**changes):
 def test_a_trail_that_cannot_be_is_refused(live, changes):
     header = SimpleNamespace(stamp=STAMP)
     live.receive(SimpleNamespace(header=header, trails=[trail(**changes)]))
-    ((name, sentence),) = live._heard.refused
+    ((name, sentence),) = live._driver.refused
     assert name == "trails" and "impossible" in sentence
     live.receive(SimpleNamespace(header=header, trails=[trail()]))
     # its stars have not come: nothing to look at

@@ -6,7 +6,7 @@ import pytest
 from fixes import NOISE, T0, fix_at, seen_at, tilt_at
 
 from starpos.errors import TiltError
-from starpos.session.calibrating import MAX_POSES, MAX_TILTS, PoseMemory, mean_tilt, tilts_of
+from starpos.session.calibrating import MAX_POSES, MAX_TILTS, PoseMemory, arguments_of, mean_tilt
 
 
 def poses_of(*frames) -> PoseMemory:
@@ -65,7 +65,7 @@ def test_poses_of_before_a_move_are_forgotten():
 
 def test_each_frame_gets_its_own_tilt():
     frames = [seen_at(0.0, x_deg=1.0), seen_at(10.0, x_deg=2.0)]
-    tilts = tilts_of(frames)
+    tilts = arguments_of(frames)["tilts"]
     assert [np.degrees(tilts.average(f.stars.mid_unix_s, 0.5).theta_x) for f in frames] == pytest.approx(
         [1.0, 2.0]
     )

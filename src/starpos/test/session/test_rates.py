@@ -18,6 +18,7 @@ from test_session import CAMERA_INFO, STARS, TILT, Told, first, messages  # noqa
 
 from starpos.fix.solution import Solution, Status
 from starpos.messages.stamp import stamp_to_unix
+from starpos.recording.topics import INPUTS
 from starpos.session.driver import Answered, Now, Sent
 
 EXPOSURE_S, SECONDS, STEP_S = 0.03, 6.0, 0.004
@@ -37,7 +38,7 @@ class Core:
     def __init__(self, messages, cost_s, *parameters):  # noqa: F811
         self.told, self.cost_s = Told("tilt_stddev:=0.0035", *parameters), cost_s
         self.session = self.told.session
-        self.session._arrived, self.session._arrived_stars = lambda: self.come(TILT), lambda: self.come(STARS)
+        self.session._arrived = lambda name: self.come(INPUTS[name])
         self.session._answer = lambda frame, _: self.answer(frame)
         info, self.begin_s = first(messages, CAMERA_INFO)
         self.stars, self.tilt = first(messages, STARS)[0], first(messages, TILT)[0]

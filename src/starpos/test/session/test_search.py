@@ -86,7 +86,7 @@ def told(scene, stars, tilt, **parameters):
         jobs.append(JobsInTurn(lambda text: None))
         return jobs[-1]
 
-    session = SolverSession(Settings.of(None, [f"{k}:={v}" for k, v in given.items()]), new, quiet, quiet)
+    session = SolverSession(Settings.of(None, [f"{k}:={v}" for k, v in given.items()]), new, quiet)
     now = Now(START + EXPOSURE, 0.0)
     camera = scene.instrument.camera_for(*SIZE)
     info = SimpleNamespace(

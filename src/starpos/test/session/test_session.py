@@ -60,9 +60,7 @@ class Told:
 
     def __init__(self, *parameters):
         self.said, self.jobs = Said(), []
-        self.session = SolverSession(
-            Settings.of(None, (*KNOWN, *parameters)), self._new, self.said, self.said
-        )
+        self.session = SolverSession(Settings.of(None, (*KNOWN, *parameters)), self._new, self.said)
 
     def _new(self):
         self.jobs.append(JobsInTurn(self.said.error))
@@ -250,12 +248,10 @@ def test_how_long_a_job_takes_does_not_matter_to_recorded_frames(messages):
 def test_a_replay_twice_is_the_same():
     def played():
         said = Said()
-        return [
-            repr(replace(m, stamp=None)) for m in Replay(Settings.of(None, KNOWN), said, said).play(NIGHT)
-        ]
+        return [repr(replace(m, stamp=None)) for m in Replay(Settings.of(None, KNOWN), said).play(NIGHT)]
 
     first = played()
-    assert first == played() and len(first) == 20
+    assert first == played() and len(first) == 10
 
 
 def test_tilts_stamped_before_their_time_are_refused_though_they_are_read_when_it_has_come(messages):
@@ -322,7 +318,7 @@ def test_a_site_that_the_stars_contradict_gives_a_sentence_and_no_heading(messag
 
 def test_half_a_site_is_refused():
     settings = Settings.of(None, KNOWN)
-    said = settings.check(settings.values | {"site.latitude": 46.0}, frozenset({"site.latitude"}), None)
+    said = settings.check(settings.values | {"site.latitude": 46.0}, frozenset({"site.latitude"}))
     assert "belong together" in said
 
 
