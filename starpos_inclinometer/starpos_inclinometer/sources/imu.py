@@ -15,13 +15,12 @@ from starpos.instrument.tilt_log import noise_text
 from starpos.messages.tilt import MIN_MESSAGES, ImuTilts, Reading
 from starpos_common.diagnostics import time_is_simulated
 from starpos_common.topics import MatchedSubscription, subscription
-from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TiltSource
+from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TiltSource, rate_of
 
 TOPIC = "imu/data"
 QUEUE, DEPTH = 512, 1000
 # how often a simulator's publishers are looked at
 LOOK_S = 0.5
-RATE_WINDOW_S = 5.0
 # Stamps that are older when they come are of another clock.
 OLD_S = 5.0
 # A stated standard deviation over the scatter of the messages, from which on it is named as a placeholder.
@@ -76,8 +75,6 @@ class ImuSource(TiltSource):
 
     def health(self) -> Health:
         now_s, tilts = self._clock.read().monotonic_s, self._tilts
-        recent = [t for t in self._recent if now_s - t < RATE_WINDOW_S]
-        rate_hz = (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0
         counts = Counts(good=tilts.good, malformed=tilts.malformed, duplicates=tilts.averager.duplicates)
         values = {
             "messages from the future": tilts.future,
@@ -90,10 +87,9 @@ class ImuSource(TiltSource):
         return Health(
             phase=phase,
             sentence=sentence,
-            rate_hz=rate_hz,
+            rate_hz=rate_of(self._recent, now_s),
             counts=counts,
             complaint=self._complaint(),
-            step=self._clock.step,
             values=values,
         )
 

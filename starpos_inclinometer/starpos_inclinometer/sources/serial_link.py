@@ -36,13 +36,12 @@ def port_refusal(values: Mapping[str, Any]) -> str | None:
 
 
 class Decoder(Protocol):
-    """Decodes the bytes of a device and makes its commands. The link's thread uses it; any thread may read `counts`."""
+    """Decodes the bytes of a device and makes its commands. The link's thread uses it."""
 
     # What to do if bytes come but no lines.
     hint: str
 
-    @property
-    def counts(self) -> Counts: ...
+    counts: Counts
 
     @property
     def period_s(self) -> float:
@@ -78,9 +77,7 @@ class SerialLink(Link, Generic[D]):
     def __init__(self, host: Surroundings, values: Mapping[str, Any], decoder: D) -> None:
         super().__init__(host, values["port"])
         self._baud, self._decoder, self._next_command = values["baud"], decoder, 0.0
-
-    def _counts(self) -> Counts:
-        return self._decoder.counts
+        self._counts = decoder.counts
 
     def _serve(self) -> None:
         device = None
@@ -143,9 +140,9 @@ class SerialLink(Link, Generic[D]):
     def _receive(self, data: bytes, moment: Moment) -> tuple[bool, bool]:
         """Take bytes; return whether they held valid lines, and samples."""
         with self._lock:
-            before = self._decoder.counts.good
+            before = self._counts.good
             arrivals = self._decoder.decode(data, moment)
-            lines = self._decoder.counts.good > before
+            lines = self._counts.good > before
         if self._decoder.answered:
             self._next_command = 0.0
         if arrivals:
