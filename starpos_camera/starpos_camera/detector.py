@@ -9,8 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
@@ -36,8 +34,8 @@ from starpos_camera.after_solution import Annotator, TrailFinder
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, Troubles, time_is_simulated
 from starpos_common.messages import encoding_of, stars_to_message
 from starpos_common.parameters import declare
-from starpos_common.topics import MatchedSubscription, Take, publisher, subscription
-from starpos_common.worker import Worker
+from starpos_common.topics import MatchedSubscription, Take, publisher, steady_timer, subscription
+from starpos_common.worker import Worker, failure_of_frame
 from starpos_interfaces.msg import Capture, StarArray
 from starpos_interfaces.srv import SetCapture
 
@@ -72,8 +70,7 @@ class FrameTopics:
         # Where frames are expected, for sentences.
         self.where = f" on {self._raw.topic}"
         self._look()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(PUBLISHERS_LOOK_S, self._look, clock=steady)
+        self._timer = steady_timer(node, PUBLISHERS_LOOK_S, self._look)
 
     def unheard(self) -> str:
         """Sentence on publishers that cannot be heard, and why; '' without any."""
@@ -205,8 +202,6 @@ class DetectorNode(Node):
         self._held: deque[tuple[Image | CompressedImage, float]] = deque()
         self._frames = self._bad = 0
         self._pace = Pace()
-        # Type and sequence number of the last image; None: the middleware gives none.
-        self._sequence: tuple[type, int | None] = (Image, None)
         self._troubles = Troubles(self)
         # What was wrong with a frame since the last report.
         self._complaint = ""
@@ -230,8 +225,7 @@ class DetectorNode(Node):
             self._listen()
 
     def _listen(self) -> None:
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._look = self.create_timer(LOOK_S, self._go_on, clock=steady, autostart=False)
+        self._look = steady_timer(self, LOOK_S, self._go_on, autostart=False)
         captures = subscription(self, Capture, "camera/capture", self._on_capture, CAPTURES_KEPT)
         self._captures_come = captures.get_publisher_count
         self._topics = FrameTopics(self, self._on_image, both=time_is_simulated(self))
@@ -259,11 +253,7 @@ class DetectorNode(Node):
         """Have the worker find the stars of the frame that `make` decodes, which may take long."""
         self._pace.took(time.monotonic())
         if self._worker.offer((make, header)):
-            self._drop()
-
-    def _drop(self, frames: int = 1) -> None:
-        """Note frames that were replaced by others."""
-        self._pace.drop(time.monotonic(), frames)
+            self._pace.drop(time.monotonic())
 
     def _arrived(self) -> None:
         now = time.monotonic()
@@ -279,7 +269,7 @@ class DetectorNode(Node):
         self._go_on()
 
     def _on_image(self, message: Image | CompressedImage, info: Mapping[str, Any]) -> None:
-        self._count_overwritten(type(message), info["publication_sequence_number"])
+        self._pace.numbered(info["publication_sequence_number"], time.monotonic(), type(message))
         first = self._last_frame_s is None
         self._arrived()
         try:
@@ -305,7 +295,7 @@ class DetectorNode(Node):
                 self._offer_image(self._held.popleft()[0])
             elif self._ready(1) and self._too_many:
                 self._held.popleft()
-                self._drop()
+                self._pace.drop(time.monotonic())
             else:
                 break
         if not self._held:
@@ -338,13 +328,6 @@ class DetectorNode(Node):
             # The Capture has values that no exposure and no clock can have.
             self._complain(str(error))
 
-    def _count_overwritten(self, kind: type, sequence: int | None) -> None:
-        """Count the frames that newer ones replaced in the middleware; a lower number comes from another publisher."""
-        before, last = self._sequence
-        if sequence is not None and last is not None and kind is before and sequence > last:
-            self._drop(sequence - last - 1)
-        self._sequence = kind, sequence
-
     def _detect(self, job: tuple[Callable[[], Frame], Header]) -> DetectedFrame:
         """Find the stars of a frame, in the worker's thread."""
         # The CPU time of this thread alone: others may draw or render meanwhile.
@@ -374,12 +357,8 @@ class DetectorNode(Node):
                     if self._trail_finder is not None:
                         self._trail_finder.offer(*subject)
                 self._last = replace(result, frame=None)
-            elif isinstance(result, StarposError):
-                self._complain(str(result))
             else:
-                # A defect loses only this frame; the node goes on.
-                kind = type(result).__name__
-                self._complain(f"a frame was given up ({kind}: {result}); keep it and report this.")
+                self._complain(failure_of_frame(result))
         self._go_on()
 
     def _complain(self, sentence: str) -> None:

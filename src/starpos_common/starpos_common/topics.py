@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers and subscriptions: QoS that the user may override, a driver's reliability, lost messages, other publishers.
+"""Topics and timers: QoS that the user may override, a driver's reliability, lost messages, other publishers.
 
 The QoS of each topic is in the parameters `qos_overrides.TOPIC...`.
 """
@@ -10,12 +10,15 @@ from contextlib import contextmanager
 from typing import Any
 
 from rclpy._rclpy_pybind11 import RCLError
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QosCallbackResult, QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from starpos.parameters.table import ParameterError
@@ -106,6 +109,12 @@ def _overridden(node: Node, topic: str) -> Iterator[None]:
         # The policy has no such value, or the depth is not allowed.
         name = f"qos_overrides.{node.resolve_topic_name(topic)}"
         raise ParameterError(f"{name}: {error}.") from None
+
+
+def steady_timer(node: Node, period_s: float, call: Callable[[], object], autostart: bool = True) -> Timer:
+    """Make a timer of real time, which goes on while simulated time stands still or the system's clock is set back."""
+    steady = Clock(clock_type=ClockType.STEADY_TIME)
+    return node.create_timer(period_s, call, clock=steady, autostart=autostart)
 
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT

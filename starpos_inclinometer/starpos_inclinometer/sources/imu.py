@@ -6,15 +6,13 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
 from starpos.instrument.tilt_log import noise_text
 from starpos.messages.tilt import MIN_MESSAGES, ImuTilts, Reading
 from starpos_common.diagnostics import time_is_simulated
-from starpos_common.topics import MatchedSubscription, subscription
+from starpos_common.topics import MatchedSubscription, steady_timer, subscription
 from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TiltSource, rate_of
 
 TOPIC = "imu/data"
@@ -44,7 +42,7 @@ class ImuSource(TiltSource):
         if time_is_simulated(host.node):
             # of a replay none may be lost; a simulator may offer best effort only
             matched = MatchedSubscription(host.node, Imu, TOPIC, self._hear, DEPTH)
-            host.node.create_timer(LOOK_S, matched.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            steady_timer(host.node, LOOK_S, matched.look)
             self._topic = matched.topic
         else:
             best_effort = ReliabilityPolicy.BEST_EFFORT

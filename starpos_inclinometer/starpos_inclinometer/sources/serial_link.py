@@ -88,7 +88,9 @@ class SerialLink(Link, Generic[D]):
             self._enter(Phase.ABSENT, self._explain(error, opened=device is not None))
         finally:
             if device is not None:
-                _close(device)
+                # If the device is gone there is nothing left to close.
+                with contextlib.suppress(*PORT_ERRORS):
+                    device.close()
 
     def _open(self) -> serial.Serial:
         device = serial.Serial(
@@ -124,7 +126,8 @@ class SerialLink(Link, Generic[D]):
                 self._enter(
                     Phase.SILENT, f"{self.name} is open but silent: check the device's power and cable."
                 )
-                if self._moved(device):
+                # The path may lead to another device now; OSError if it leads nowhere.
+                if os.stat(self.name).st_rdev != os.fstat(device.fileno()).st_rdev:
                     return
             elif now - last_line > patience:
                 self._enter(
@@ -150,10 +153,6 @@ class SerialLink(Link, Generic[D]):
             self._admit(arrivals, [moment.monotonic_s] * len(samples), f"receiving from {self.name}")
         return lines, bool(arrivals)
 
-    def _moved(self, device: serial.Serial) -> bool:
-        """Whether the path now leads to another device than the open one; OSError if it leads nowhere."""
-        return os.stat(self.name).st_rdev != os.fstat(device.fileno()).st_rdev
-
     def _explain(self, error: Exception, opened: bool) -> str:
         code = getattr(error, "errno", None)
         if opened:
@@ -166,9 +165,3 @@ class SerialLink(Link, Generic[D]):
             return f"{self.name} is in use by another process: end that one; it is retried."
         text = " ".join(str(error).split())
         return f"{self.name} is no usable serial port ({text}): set `port` to the device; it is retried."
-
-
-def _close(device: serial.Serial) -> None:
-    # If the device is gone there is nothing left to close.
-    with contextlib.suppress(*PORT_ERRORS):
-        device.close()

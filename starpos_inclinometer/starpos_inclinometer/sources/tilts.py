@@ -161,8 +161,6 @@ class SensorTilts:
         self, angles: Sequence[float], turned: tuple[float, float]
     ) -> tuple[float, float, float, float]:
         """Derivatives of S's x and y by the sensor's own, as `cross_axis` has them."""
-        if self.cross_axis == SQUARE_AXES:
-            return SQUARE_AXES
         xx, xy, yx, yy = self.cross_axis
         # An angle of 90 deg has no slope.
         cx, cy, x, y = (max(math.cos(angle), 0.1) for angle in (*angles[:2], *turned))
