@@ -118,6 +118,8 @@ def steady_timer(node: Node, period_s: float, call: Callable[[], object], autost
 
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+# how often publishers are compared with a subscription
+LOOK_S = 0.5
 # maximum number of publishers and topics named in a sentence
 MAX_NAMED = 3
 
@@ -141,20 +143,22 @@ class MatchedSubscription:
         self._fixed = self._qos.reliability != RELIABLE
         package = kind.__module__.partition(".")[0]
         self._type = f"{package}/msg/{kind.__name__}"
+        self._look()
+        self._timer = steady_timer(node, LOOK_S, self._look)
 
     @property
     def publishers(self) -> list[TopicEndpointInfo]:
         """The publishers of this topic and type that the graph shows."""
         return [p for p in self._offered() if p.topic_type == self._type]
 
-    def look(self) -> None:
+    def _look(self) -> None:
         """Take the reliability that is offered now."""
         offered = {p.qos_profile.reliability for p in self.publishers}
         wanted = BEST_EFFORT if offered == {BEST_EFFORT} else RELIABLE
         if self._fixed or wanted == self._qos.reliability:
             return
         self._qos = QoSProfile(history=self._qos.history, depth=self._qos.depth, reliability=wanted)
-        self.destroy()
+        self._node.destroy_subscription(self._subscription)
         self._subscription = self._node.create_subscription(
             self._kind, self.topic, self._callback, self._qos, event_callbacks=SILENT
         )
@@ -162,6 +166,7 @@ class MatchedSubscription:
         self._node.get_logger().info(f"{self.topic} is heard {how}.")
 
     def destroy(self) -> None:
+        self._node.destroy_timer(self._timer)
         self._node.destroy_subscription(self._subscription)
 
     def unheard(self) -> str:

@@ -12,13 +12,11 @@ from sensor_msgs.msg import Imu
 from starpos.instrument.tilt_log import noise_text
 from starpos.messages.tilt import MIN_MESSAGES, ImuTilts, Reading
 from starpos_common.diagnostics import time_is_simulated
-from starpos_common.topics import MatchedSubscription, steady_timer, subscription
+from starpos_common.topics import MatchedSubscription, subscription
 from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TiltSource, rate_of
 
 TOPIC = "imu/data"
 QUEUE, DEPTH = 512, 1000
-# how often a simulator's publishers are looked at
-LOOK_S = 0.5
 # Stamps that are older when they come are of another clock.
 OLD_S = 5.0
 # A stated standard deviation over the scatter of the messages, from which on it is named as a placeholder.
@@ -41,9 +39,7 @@ class ImuSource(TiltSource):
         self._heard_s = self._told_s = -math.inf
         if time_is_simulated(host.node):
             # of a replay none may be lost; a simulator may offer best effort only
-            matched = MatchedSubscription(host.node, Imu, TOPIC, self._hear, DEPTH)
-            steady_timer(host.node, LOOK_S, matched.look)
-            self._topic = matched.topic
+            self._topic = MatchedSubscription(host.node, Imu, TOPIC, self._hear, DEPTH).topic
         else:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             self._topic = subscription(host.node, Imu, TOPIC, self._hear, DEPTH, best_effort).topic_name
