@@ -58,7 +58,10 @@ class CameraNode(Node):
         """
         super().__init__("camera", **options)
         self._values = declare(
-            self, parameters_of("camera"), apply=self._apply, check=lambda values, _: _complaint(values)
+            self,
+            parameters_of("camera"),
+            apply=self._apply,
+            check=lambda values, _: SOURCES[values["source"]].refusal(values, _settings(values)),
         )
         self._calibration_path: Path | None = None
         self._calibration: Camera | None = None
@@ -328,7 +331,3 @@ def _shutter(capture: Capture) -> str:
 def _settings(values: Mapping[str, Any]) -> CaptureSettings:
     exposure_s, gain = (None if math.isnan(values[name]) else values[name] for name in ("exposure", "gain"))
     return CaptureSettings(exposure_s, gain, values["cadence"])
-
-
-def _complaint(values: Mapping[str, Any]) -> str | None:
-    return SOURCES[values["source"]].refusal(values, _settings(values))

@@ -164,9 +164,6 @@ class AravisCamera:
             "" if abs(told - wanted) <= 0.01 * max(1.0, wanted) else f"its gain is {told:g}, not {wanted:g}."
         )
 
-    def trigger(self) -> None:
-        self.camera.software_trigger()
-
     def drain(self) -> None:
         """Leave out the frames that came before."""
         while (buffer := self._stream.try_pop_buffer()) is not None:
@@ -326,7 +323,7 @@ class Aravis(DeviceSource[AravisCamera]):
         camera.drain()
         asked_s, commanded_s = time.time(), self._now()
         if triggers:
-            camera.trigger()
+            camera.camera.software_trigger()
         frame, camera_s, arrival_s = self._wait(camera, asked_s, exposure_s)
         # The arrival by the node's clock, which need not be the system's.
         received_s = self._now() - (time.time() - arrival_s)

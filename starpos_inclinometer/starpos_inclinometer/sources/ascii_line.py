@@ -18,7 +18,7 @@ from starpos_inclinometer.clock import ArrivalFilter, Moment, PaceWatch
 from starpos_inclinometer.sources.mcu_protocol import Gate, clocks_agree
 from starpos_inclinometer.sources.serial_link import SerialLink, port_refusal
 from starpos_inclinometer.sources.source import Arrival, Counts, Surroundings
-from starpos_inclinometer.sources.tilts import SensorTilts, noise_floor_rad
+from starpos_inclinometer.sources.tilts import SensorTilts
 
 # In bytes.
 MAX_LINE = 256
@@ -245,7 +245,7 @@ class AsciiSource(SerialLink[LineDecoder]):
         range_deg = values["ascii.range"]
         self._tilts.range_rad = math.pi / 2 if math.isnan(range_deg) else math.radians(range_deg)
         self._tilts.stuck = values["ascii.stuck_samples"]
-        self._tilts.noise_floor_rad = noise_floor_rad(values)
+        self._tilts.configure(values)
         self._latency_s = 0.0 if math.isnan(values["latency"]) else values["latency"]
 
     def fetch(self) -> list[Reading]:

@@ -21,7 +21,7 @@ from starpos_inclinometer.sources.iio_device import (
     set_sampling_frequency,
 )
 from starpos_inclinometer.sources.source import Arrival, Health, Link, Phase, Surroundings
-from starpos_inclinometer.sources.tilts import SensorTilts, noise_floor_rad
+from starpos_inclinometer.sources.tilts import SensorTilts
 
 PATIENCE_S = 1.0
 # If reading the channels takes longer, this process stood still in between.
@@ -105,7 +105,7 @@ class IioSource(Link):
         self._parameters = values
         self._rate_hz = values["rate"]
         self.angles.stuck = values["iio.stuck_samples"]
-        self.angles.noise_floor_rad = noise_floor_rad(values)
+        self.angles.configure(values)
         self._latency_s = 0.0 if math.isnan(values["latency"]) else values["latency"]
         self.forces.configure(values)
 
