@@ -54,9 +54,8 @@ def dated_by_driver(
     between_s: tuple[float, float],
     values: Mapping,
 ) -> CapturedFrame:
-    """Date a frame, whose exposure is known, by the better time: the start that is reported, or the command.
+    """Date a frame, whose exposure is known, by the better time: the driver's start (`told`, ISO 8601), or the command.
 
-    told: the start as the driver reports it, in ISO 8601.
     clock_stddev_s: of the driver's clock; 0: it is this machine's clock; NaN: unknown, and the start is not used.
     between_s: Unix times of command and arrival. A start that does not fit between them is not used.
     """
