@@ -405,8 +405,9 @@ class Indi(DeviceSource[IndiDevice]):
         frame, header = read_fits(io.BytesIO(_fits_of(blob)), "its frame")
         if frame.untimed:
             raise CaptureError(f"the header of its frame cannot be used: {frame.untimed}.")
-        frame = replace(frame, exposure_s=frame.exposure_s or exposure_s)
-        check_exposed(frame.exposure_s, exposure_s, between_s)
+        exposed_s = frame.exposure_s or exposure_s
+        check_exposed(exposed_s, exposure_s, between_s)
+        frame = replace(frame, exposure_s=exposed_s)
         told, clock_s = str(header.get("DATE-OBS", "")), clock_stddev_of("indi", self._host, self._values)
         return dated_by_driver(frame, told, clock_s, between_s, self._values)
 
