@@ -234,8 +234,6 @@ class Alpaca(DeviceSource[AlpacaCamera]):
         return replace(taken, remark=taken.remark or remark)
 
     def _explain(self, error: Exception) -> str:
-        if isinstance(error, CaptureError):
-            return str(error)
         if isinstance(error, TimeoutError):
             return "it does not answer in time; check the server and the network."
         if isinstance(error, (OSError, HTTPException)):

@@ -15,7 +15,7 @@ from string import digits
 from types import ModuleType
 from typing import Any
 
-from starpos.errors import StarposError, one_line
+from starpos.errors import one_line
 from starpos.frames.encodings import MOSAICS
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import MAX_PIXELS, Frame
@@ -311,8 +311,6 @@ class Aravis(DeviceSource[AravisCamera]):
 
     def _explain(self, error: Exception) -> str:
         # Aravis reports everything as GLib.Error, and a camera's strange answers cause others.
-        if isinstance(error, StarposError):
-            return str(error)
         words = one_line(getattr(error, "message", error)).rstrip(".")
         return f"{words or type(error).__name__}; check its cable, its power, and programs that hold it."
 

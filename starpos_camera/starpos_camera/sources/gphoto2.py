@@ -251,7 +251,7 @@ class Gphoto2(DeviceSource[Gphoto2Camera]):
     def _explain(self, error: Exception) -> str | None:
         import gphoto2
 
-        return sentence(error.code) if isinstance(error, gphoto2.GPhoto2Error) else super()._explain(error)
+        return sentence(error.code) if isinstance(error, gphoto2.GPhoto2Error) else None
 
     def _open(self) -> Gphoto2Camera:
         """Open the camera and make the settings that hold as long as it is open."""

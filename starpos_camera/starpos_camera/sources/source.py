@@ -131,7 +131,7 @@ class DeviceSource(FrameSource, Generic[D]):
                 taken = self._expose(self._device, settings)
             except Exception as error:
                 self._release()
-                why = self._explain(error)
+                why = str(error) if isinstance(error, StarposError) else self._explain(error)
                 if why is None:
                     raise
                 raise CaptureError(f"{self.hardware_id}: {why}") from error
@@ -156,8 +156,8 @@ class DeviceSource(FrameSource, Generic[D]):
         raise NotImplementedError
 
     def _explain(self, error: Exception) -> str | None:
-        """Say in a sentence what an error means; None for a defect, which the node reports as one."""
-        return str(error) if isinstance(error, StarposError) else None
+        """Say in a sentence what an error of a library means; None for a defect, which the node reports as one."""
+        return None
 
 
 def decoded(encoding: str, data: bytes, size: tuple[int, int], more: int = 0) -> tuple[np.ndarray, str]:

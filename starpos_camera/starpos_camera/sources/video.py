@@ -114,8 +114,7 @@ class Video(DeviceSource["VideoCapture"]):
         return replace(dated(frame, mid_s, stddev_s, stamp), remark=remark)
 
     def _explain(self, error: Exception) -> str:
-        text = str(error) if isinstance(error, CaptureError) else f"{type(error).__name__}: {error}."
-        return " ".join(text.split())
+        return " ".join(f"{type(error).__name__}: {error}.".split())
 
     def _open(self) -> "VideoCapture":
         with quiet_opencv() as cv2:

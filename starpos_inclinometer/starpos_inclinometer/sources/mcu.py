@@ -30,7 +30,7 @@ from starpos_inclinometer.sources.mcu_protocol import (
     mcu_follows,
 )
 from starpos_inclinometer.sources.serial_link import SerialLink, port_refusal
-from starpos_inclinometer.sources.source import Arrival, Surroundings
+from starpos_inclinometer.sources.source import Arrival, Health, Surroundings
 from starpos_inclinometer.sources.tilts import (
     BoardSensor,
     Sca100t,
@@ -316,10 +316,11 @@ class McuSource(SerialLink[McuDecoder]):
         reading = self.sensor.measure(sample, moment.monotonic_s - late_s, stamp_ns)
         return reading if known_s is not None else replace(reading, flags=reading.flags | TIME_UNKNOWN)
 
-    def _complaint(self) -> str:
+    def health(self) -> Health:
         if not self._decoder.refused:
-            return ""
-        return f"the microcontroller refused {self._decoder.wanted_rate_hz} Hz: set another `rate`."
+            return super().health()
+        complaint = f"the microcontroller refused {self._decoder.wanted_rate_hz} Hz: set another `rate`."
+        return replace(super().health(), complaint=complaint)
 
     def _shown(self) -> Mapping[str, object]:
         identity = self._decoder.identity

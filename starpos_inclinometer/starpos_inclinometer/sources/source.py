@@ -179,7 +179,7 @@ class Link(TiltSource):
         return arrivals
 
     def health(self) -> Health:
-        shown, complaint = self._shown(), self._complaint()
+        shown = self._shown()
         with self._lock:
             rate_hz = rate_of(self._recent, self._clock.monotonic_s())
             values = {"openings": self._connections, "unfetched samples": self._dropped, **shown}
@@ -188,13 +188,8 @@ class Link(TiltSource):
                 sentence=self._sentence,
                 rate_hz=rate_hz if self._phase is Phase.RECEIVING else 0.0,
                 counts=replace(self._counts),
-                complaint=complaint,
                 values=values,
             )
-
-    def _complaint(self) -> str:
-        """What is wrong although samples come; '' for nothing."""
-        return ""
 
     def _shown(self) -> Mapping[str, object]:
         """What diagnostics show besides the link."""
