@@ -2,7 +2,8 @@
 """What the detector does with a frame once the solver has answered it: the annotated image, and the trails."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -27,11 +28,13 @@ NAME_LETTERS, SENTENCE_LETTERS = 24, 300
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A frame, the stars found in it, and the header of both."""
+    """A frame, the stars found in it, the header of both, and what the solver says of them, or why it says nothing."""
 
     frame: Frame
     stars: Stars
     header: Header
+    identified: Identified = field(default_factory=Identified)
+    remarks: Sequence[str] = ()
 
 
 class AfterSolution:
@@ -59,8 +62,8 @@ class AfterSolution:
     def wanted(self) -> bool:
         return self.publisher.get_subscription_count() > 0
 
-    def work(self, job: tuple[Subject, Identified, list[str]]) -> Any:
-        """The message on a frame, its stars' names and remarks on its solution, in the worker's thread; None: nothing."""
+    def work(self, subject: Subject) -> Any:
+        """The message on a frame, in the worker's thread; None: there is nothing to be said."""
         raise NotImplementedError
 
     def stop(self) -> None:
@@ -106,9 +109,10 @@ class AfterSolution:
         if subject is None or not self.wanted:
             return
         if solution is None:
-            self._worker.offer((subject, Identified(), [without]))
+            self._worker.offer(replace(subject, remarks=[without]))
         else:
-            self._worker.offer((subject, _identified(solution, len(subject.stars)), _remarks(solution)))
+            identified = _identified(solution, len(subject.stars))
+            self._worker.offer(replace(subject, identified=identified, remarks=_remarks(solution)))
 
     def _on_wake(self) -> None:
         for result in self._worker.fetch():
@@ -129,9 +133,8 @@ class Annotator(AfterSolution):
     def __init__(self, node: Node) -> None:
         super().__init__(node, Image, "~/image_annotated", 1, "annotation")
 
-    def work(self, job: tuple[Subject, Identified, list[str]]) -> Image:
-        subject, identified, remarks = job
-        picture = annotate(subject.frame, subject.stars, identified, remarks)
+    def work(self, subject: Subject) -> Image:
+        picture = annotate(subject.frame, subject.stars, subject.identified, subject.remarks)
         message = frame_to_message(Frame(picture), "")
         message.header = subject.header
         return message
@@ -143,12 +146,11 @@ class TrailFinder(AfterSolution):
     def __init__(self, node: Node) -> None:
         super().__init__(node, TrailArray, "trails", 10, "search for trails")
 
-    def work(self, job: tuple[Subject, Identified, list[str]]) -> TrailArray | None:
+    def work(self, subject: Subject) -> TrailArray | None:
         from starpos.detection.trails import find_trails
 
-        subject, identified, _ = job
-        stars, rows = subject.stars, identified.star
-        if not len(rows):
+        stars, rows = subject.stars, subject.identified.star
+        if not rows:
             return None
         found = find_trails(subject.frame, stars, stars.x[rows], stars.y[rows], stars.flux[rows])
         return trails_to_message(found, subject.header)
