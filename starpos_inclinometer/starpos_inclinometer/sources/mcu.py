@@ -319,8 +319,10 @@ class McuSource(SerialLink[McuDecoder]):
     def health(self) -> Health:
         if not self._decoder.refused:
             return super().health()
-        complaint = f"the microcontroller refused {self._decoder.wanted_rate_hz} Hz: set another `rate`."
-        return replace(super().health(), complaint=complaint)
+        return replace(
+            super().health(),
+            complaint=f"the microcontroller refused {self._decoder.wanted_rate_hz} Hz: set another `rate`.",
+        )
 
     def _shown(self) -> Mapping[str, object]:
         identity = self._decoder.identity
