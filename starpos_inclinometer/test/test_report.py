@@ -12,7 +12,7 @@ from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import Moment, Step
 from starpos_inclinometer.node import Reporter
 from starpos_inclinometer.sources.mcu import McuDecoder
-from starpos_inclinometer.sources.mcu_protocol import Identity, Sample
+from starpos_inclinometer.sources.mcu_protocol import Identity, Sample, frame
 from starpos_inclinometer.sources.source import Arrival, Counts, Health, Phase
 from starpos_testing.emulator import Mcu
 
@@ -59,6 +59,13 @@ def test_each_report_counts_what_came_since_the_one_before():
     assert [first[f"of these {n}"] for n in ("stuck", "saturated", "out of range")] == [2, 1, 0]
     second = reporter.report(health(counts=counts), None, 1.0)
     assert second.level == 0 and second.values["of these stuck"] == 0
+
+
+def test_a_rate_that_the_microcontroller_refuses_is_told():
+    source = mcu_source(VALUES | {"rate": 50})
+    assert source.health().complaint == ""
+    source._decoder.decode(frame(b"N,03"), Moment(0.0, 0))
+    assert "refused 50 Hz" in source.health().complaint
 
 
 def arrival(k, at_s, identity=None, **more):
