@@ -2,12 +2,11 @@
 """What the detector does with a frame once the solver has answered it: the annotated image, and the trails."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image
@@ -17,7 +16,7 @@ from starpos.frames.annotate import Identified, annotate
 from starpos.frames.frame import Frame, Stars
 from starpos_common.diagnostics import Troubles
 from starpos_common.messages import frame_to_message, trails_to_message
-from starpos_common.topics import publisher, subscription
+from starpos_common.topics import publisher, steady_timer, subscription
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Solution, TrailArray
 
@@ -29,11 +28,13 @@ NAME_LETTERS, SENTENCE_LETTERS = 24, 300
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A frame, the stars found in it, and the header of both."""
+    """A frame, the stars found in it, the header of both, and what the solver says of them, or why it says nothing."""
 
     frame: Frame
     stars: Stars
     header: Header
+    identified: Identified = field(default_factory=Identified)
+    remarks: Sequence[str] = ()
 
 
 class AfterSolution:
@@ -53,8 +54,7 @@ class AfterSolution:
         # Subscribe once now, so that a wrong qos_override is refused at the start.
         node.destroy_subscription(self._subscribe_solutions())
         self._waiting: Subject | None = None
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._patience = node.create_timer(PATIENCE_S, self._give_up, clock=steady, autostart=False)
+        self._patience = steady_timer(node, PATIENCE_S, self._give_up, autostart=False)
         self._worker = Worker(self.work, node.create_guard_condition(self._on_wake).trigger, name)
         self._worker.start()
 
@@ -62,12 +62,8 @@ class AfterSolution:
     def wanted(self) -> bool:
         return self.publisher.get_subscription_count() > 0
 
-    def work(self, job: Any) -> Any:
-        """The message of a job that `begin` gave, in the worker's thread."""
-        raise NotImplementedError
-
-    def job(self, subject: Subject, solution: Solution | None, without: str) -> Any:
-        """The job of a frame, by its solution; None: nothing is to be done.  without: why there is no solution."""
+    def work(self, subject: Subject) -> Any:
+        """The message on a frame, in the worker's thread; None: there is nothing to be said."""
         raise NotImplementedError
 
     def stop(self) -> None:
@@ -110,15 +106,20 @@ class AfterSolution:
     def _begin(self, solution: Solution | None, without: str = "") -> None:
         self._patience.cancel()
         subject, self._waiting = self._waiting, None
-        if subject is not None and self.wanted and (job := self.job(subject, solution, without)) is not None:
-            self._worker.offer(job)
+        if subject is None or not self.wanted:
+            return
+        if solution is None:
+            self._worker.offer(replace(subject, remarks=[without]))
+        else:
+            identified = _identified(solution, len(subject.stars))
+            self._worker.offer(replace(subject, identified=identified, remarks=_remarks(solution)))
 
     def _on_wake(self) -> None:
         for result in self._worker.fetch():
             if isinstance(result, self._kind):
                 self.publisher.publish(result)
                 self._troubles.right(self._name)
-            else:
+            elif result is not None:
                 kind = type(result).__name__
                 self._troubles.wrong(
                     self._name,
@@ -132,14 +133,8 @@ class Annotator(AfterSolution):
     def __init__(self, node: Node) -> None:
         super().__init__(node, Image, "~/image_annotated", 1, "annotation")
 
-    def job(self, subject: Subject, solution: Solution | None, without: str) -> Any:
-        if solution is None:
-            return subject, Identified(), [without]
-        return subject, _identified(solution, len(subject.stars)), _remarks(solution)
-
-    def work(self, job: tuple[Subject, Identified, list[str]]) -> Image:
-        subject, identified, remarks = job
-        picture = annotate(subject.frame, subject.stars, identified, remarks)
+    def work(self, subject: Subject) -> Image:
+        picture = annotate(subject.frame, subject.stars, subject.identified, subject.remarks)
         message = frame_to_message(Frame(picture), "")
         message.header = subject.header
         return message
@@ -151,15 +146,12 @@ class TrailFinder(AfterSolution):
     def __init__(self, node: Node) -> None:
         super().__init__(node, TrailArray, "trails", 10, "search for trails")
 
-    def job(self, subject: Subject, solution: Solution | None, without: str) -> Any:
-        rows = [] if solution is None else _identified(solution, len(subject.stars)).star
-        return (subject, rows) if len(rows) else None
-
-    def work(self, job: tuple[Subject, list[int]]) -> TrailArray:
+    def work(self, subject: Subject) -> TrailArray | None:
         from starpos.detection.trails import find_trails
 
-        subject, rows = job
-        stars = subject.stars
+        stars, rows = subject.stars, subject.identified.star
+        if not rows:
+            return None
         found = find_trails(subject.frame, stars, stars.x[rows], stars.y[rows], stars.flux[rows])
         return trails_to_message(found, subject.header)
 

@@ -5,22 +5,22 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import rclpy.parameter
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
 
 from starpos import system_clock
-from starpos.errors import InstrumentError, StarposError
+from starpos.errors import InstrumentError
 from starpos.files import path_of
 from starpos.frames.exposure import Shutter
+from starpos.frames.frame import Frame
 from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
@@ -29,12 +29,12 @@ from starpos.parameters.table import parameters_of
 from starpos.session.driver import Changes
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource, NothingYet, SourceEnded
-from starpos_camera.sources.timing import OF_SYSTEM_CLOCK, ShutterTimes, in_one_time
+from starpos_camera.sources.timing import OF_SYSTEM_CLOCK, ShutterTimes, check_one_time
 from starpos_common.diagnostics import ClockReport, Diagnosis, Diagnostics, Level, time_is_simulated
 from starpos_common.messages import camera_to_message, frame_to_message, shutter_fields, unix_to_stamp
 from starpos_common.parameters import declare
-from starpos_common.topics import publisher, subscription
-from starpos_common.worker import Worker
+from starpos_common.topics import publisher, steady_timer, subscription
+from starpos_common.worker import Worker, failure_of_frame
 from starpos_interfaces.msg import Capture, Pulse
 from starpos_interfaces.srv import SetCapture
 
@@ -48,16 +48,6 @@ IMAGE_DEPTH = 2
 STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated", "exif")
 
 
-@dataclass(frozen=True, eq=False)
-class PreparedFrame:
-    """A frame ready to be published: its messages (image: None without subscribers), and how long it took."""
-
-    captured: CapturedFrame
-    capture: Capture
-    image: Image | None
-    seconds: float
-
-
 class CameraNode(Node):
     """Publishes sensor_msgs/Image, CameraInfo and starpos_interfaces/Capture; see README.md."""
 
@@ -68,7 +58,10 @@ class CameraNode(Node):
         """
         super().__init__("camera", **options)
         self._values = declare(
-            self, parameters_of("camera"), apply=self._apply, check=lambda values, _: _complaint(values)
+            self,
+            parameters_of("camera"),
+            apply=self._apply,
+            check=lambda values, _: SOURCES[values["source"]].refusal(values, _settings(values)),
         )
         self._calibration_path: Path | None = None
         self._calibration: Camera | None = None
@@ -112,8 +105,8 @@ class CameraNode(Node):
         tasks: dict[str, Callable[[], Diagnosis]] = {"Capture": self._report, "Clock": self._clock_report}
         self._diagnostics = Diagnostics(self, tasks, self._source.hardware_id)
         # Simulated time sets the pace of a replay. The system's clock may be stepped, and a timer on it would wait.
-        clock = self.get_clock() if time_is_simulated(self) else Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(self._values["cadence"], self._tick, clock=clock)
+        timer = self.create_timer if time_is_simulated(self) else partial(steady_timer, self)
+        self._timer = timer(self._values["cadence"], self._tick)
         self._worker.start()
         if lack := self._source.lacking():
             self._say(Level.WARN, lack)
@@ -153,8 +146,8 @@ class CameraNode(Node):
         wanted = self._detector is not None and self._detector.wanted
         return wanted or self._images.get_subscription_count() > 0
 
-    def _prepare(self, settings: CaptureSettings) -> PreparedFrame:
-        """Take a frame and make it ready to be published, in the worker's thread."""
+    def _prepare(self, settings: CaptureSettings) -> tuple[CapturedFrame, Capture, Image | None, float]:
+        """Take a frame and make it ready for `_publish`, in the worker's thread."""
         begin = time.monotonic()
         if time_is_simulated(self):
             exposure, clock = self._source.capture(settings), None
@@ -179,11 +172,14 @@ class CameraNode(Node):
         heard = self._images.get_subscription_count()
         image = frame_to_message(frame, header.frame_id) if heard else None
         exposure = replace(exposure, frame=frame)
-        return PreparedFrame(exposure, capture, image, time.monotonic() - begin)
+        return exposure, capture, image, time.monotonic() - begin
 
     def _capture(self, settings: CaptureSettings) -> CapturedFrame:
-        since_s = self._now_s()
-        exposure = in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
+        # Diagnostics ask the watch every second, also during the capture.
+        since_s, watch = self._now_s(), self._clock_report.watch
+        set_s = watch.set_s()
+        exposure = self._source.capture(settings)
+        check_one_time(exposure, watch.set_s() - set_s)
         return self._shutter.date_frame(exposure, since_s, self._now_s()) if self._shutter else exposure
 
     def _on_wake(self) -> None:
@@ -195,30 +191,27 @@ class CameraNode(Node):
                 # Waiting between two frames is normal; a trouble is shown for a while before it.
                 if self._state[0] is not Level.OK and time.monotonic() > self._said_s + SHOWN_S:
                     self._say(Level.OK, str(result))
-            elif isinstance(result, StarposError):
-                self._failed += 1
-                self._say(Level.ERROR, str(result))
             elif isinstance(result, Exception):
-                # A defect loses only this frame; the node goes on.
                 self._failed += 1
-                kind = type(result).__name__
-                self._say(Level.ERROR, f"a frame was given up ({kind}: {result}); keep it and report this.")
+                self._say(Level.ERROR, failure_of_frame(result))
             else:
-                self._publish(result)
+                self._publish(*result)
 
-    def _publish(self, prepared: PreparedFrame) -> None:
-        exposure, capture = prepared.captured, prepared.capture
-        frame, camera = exposure.frame, self._intrinsics(exposure)
+    def _publish(
+        self, exposure: CapturedFrame, capture: Capture, image: Image | None, seconds: float
+    ) -> None:
+        """Publish a frame and its messages (image: None without subscribers); seconds: how long it took."""
+        frame, camera = exposure.frame, self._intrinsics(exposure.frame)
         info = camera_to_message(camera, capture.header.frame_id)
         info.header = capture.header
         self._captures.publish(capture)
         self._infos.publish(info)
-        if prepared.image is not None:
-            self._images.publish(prepared.image)
+        if image is not None:
+            self._images.publish(image)
         if self._detector is not None:
             self._detector.submit(frame, capture.header)
         self._frames += 1
-        self._last, self._last_took_s = capture, prepared.seconds
+        self._last, self._last_took_s = capture, seconds
         self._size = frame.width, frame.height
         if (camera.width, camera.height) != self._size:
             self._say(
@@ -231,11 +224,9 @@ class CameraNode(Node):
         else:
             self._say(Level.OK, f"taking frames of {frame.width} x {frame.height} px.")
 
-    def _intrinsics(self, exposure: CapturedFrame) -> Camera:
-        if known := self._calibration or exposure.camera:
-            return known
+    def _intrinsics(self, frame: Frame) -> Camera:
         focal_px = focal_px_of(self._values["focal_mm"], self._values["pixel_um"])
-        return Camera.from_focal(exposure.frame.width, exposure.frame.height, focal_px)
+        return self._calibration or Camera.from_focal(frame.width, frame.height, focal_px)
 
     def _say(self, level: Level, sentence: str) -> None:
         """Set the state; log it if it differs from the last logged one."""
@@ -340,7 +331,3 @@ def _shutter(capture: Capture) -> str:
 def _settings(values: Mapping[str, Any]) -> CaptureSettings:
     exposure_s, gain = (None if math.isnan(values[name]) else values[name] for name in ("exposure", "gain"))
     return CaptureSettings(exposure_s, gain, values["cadence"])
-
-
-def _complaint(values: Mapping[str, Any]) -> str | None:
-    return SOURCES[values["source"]].refusal(values, _settings(values))

@@ -6,11 +6,9 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
@@ -35,16 +33,14 @@ from starpos_camera.after_solution import Annotator, TrailFinder
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, Troubles, time_is_simulated
 from starpos_common.messages import encoding_of, stars_to_message
 from starpos_common.parameters import declare
-from starpos_common.topics import MatchedSubscription, Take, publisher, subscription
-from starpos_common.worker import Worker
+from starpos_common.topics import LOOK_S, MatchedSubscription, Take, publisher, steady_timer, subscription
+from starpos_common.worker import Worker, failure_of_frame
 from starpos_interfaces.msg import Capture, StarArray
 from starpos_interfaces.srv import SetCapture
 
 RAW, COMPRESSED = "camera/image_raw", "camera/image_raw/compressed"
 # Only the newest frame is kept; each more would take another 42 MB.
 IMAGE_DEPTH = 1
-# how often publishers are compared with the subscriptions
-PUBLISHERS_LOOK_S = 0.5
 # number of stamps of a topic by which a frame that the other one brings later is known
 STAMPS_KEPT = 4
 
@@ -71,8 +67,7 @@ class FrameTopics:
         # Where frames are expected, for sentences.
         self.where = f" on {self._raw.topic}"
         self._look()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(PUBLISHERS_LOOK_S, self._look, clock=steady)
+        self._timer = steady_timer(node, LOOK_S, self._look)
 
     def unheard(self) -> str:
         """Sentence on publishers that cannot be heard, and why; '' without any."""
@@ -93,7 +88,6 @@ class FrameTopics:
 
     def _look(self) -> None:
         """Adapt the subscriptions to what is published."""
-        self._raw.look()
         self._raw_sends &= bool(self._raw.publishers)
         offered = self._node.count_publishers(self.compressed_topic) > 0
         wanted = self._both or (offered and not self._raw_sends)
@@ -105,8 +99,6 @@ class FrameTopics:
         elif not wanted and self._compressed is not None:
             self._compressed.destroy()
             self._compressed = None
-        if self._compressed is not None:
-            self._compressed.look()
 
     def _pass_raw(self, message: Image, info: Mapping[str, Any]) -> None:
         self._raw_sends = True
@@ -133,7 +125,7 @@ CAPTURE_PATIENCE_S = 3.5
 DISCOVERY_S = 0.5
 # Maximum number of waiting frames, of 42 MB each.
 MAX_HELD = 3
-LOOK_S = 0.1
+HELD_LOOK_S = 0.1
 # Share by which a camera's exposure may differ from the one asked for, and how many frames may be of the one before.
 AS_ASKED, FRAMES_ON_THEIR_WAY = 0.1, 3
 # Silence is reported after this time, and after three times the interval between the last two frames.
@@ -142,9 +134,8 @@ MIN_SILENCE_S = 5.0
 
 @dataclass(frozen=True, eq=False)
 class DetectedFrame:
-    """Stars of a frame, ready to be published, and the time it took. The frame is dropped once they are published."""
+    """Stars of a frame, ready to be published, and the time it took."""
 
-    frame: Frame | None
     message: StarArray
     detection: Detection
     cpu_ms: float
@@ -204,8 +195,6 @@ class DetectorNode(Node):
         self._held: deque[tuple[Image | CompressedImage, float]] = deque()
         self._frames = self._bad = 0
         self._pace = Pace()
-        # Type and sequence number of the last image; None: the middleware gives none.
-        self._sequence: tuple[type, int | None] = (Image, None)
         self._troubles = Troubles(self)
         # What was wrong with a frame since the last report.
         self._complaint = ""
@@ -229,8 +218,7 @@ class DetectorNode(Node):
             self._listen()
 
     def _listen(self) -> None:
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._look = self.create_timer(LOOK_S, self._go_on, clock=steady, autostart=False)
+        self._look = steady_timer(self, HELD_LOOK_S, self._go_on, autostart=False)
         captures = subscription(self, Capture, "camera/capture", self._on_capture, CAPTURES_KEPT)
         self._captures_come = captures.get_publisher_count
         self._topics = FrameTopics(self, self._on_image, both=time_is_simulated(self))
@@ -258,11 +246,7 @@ class DetectorNode(Node):
         """Have the worker find the stars of the frame that `make` decodes, which may take long."""
         self._pace.took(time.monotonic())
         if self._worker.offer((make, header)):
-            self._drop()
-
-    def _drop(self, frames: int = 1) -> None:
-        """Note frames that were replaced by others."""
-        self._pace.drop(time.monotonic(), frames)
+            self._pace.drop(time.monotonic())
 
     def _arrived(self) -> None:
         now = time.monotonic()
@@ -278,7 +262,7 @@ class DetectorNode(Node):
         self._go_on()
 
     def _on_image(self, message: Image | CompressedImage, info: Mapping[str, Any]) -> None:
-        self._count_overwritten(type(message), info["publication_sequence_number"])
+        self._pace.numbered(info["publication_sequence_number"], time.monotonic(), type(message))
         first = self._last_frame_s is None
         self._arrived()
         try:
@@ -304,7 +288,7 @@ class DetectorNode(Node):
                 self._offer_image(self._held.popleft()[0])
             elif self._ready(1) and self._too_many:
                 self._held.popleft()
-                self._drop()
+                self._pace.drop(time.monotonic())
             else:
                 break
         if not self._held:
@@ -337,14 +321,7 @@ class DetectorNode(Node):
             # The Capture has values that no exposure and no clock can have.
             self._complain(str(error))
 
-    def _count_overwritten(self, kind: type, sequence: int | None) -> None:
-        """Count the frames that newer ones replaced in the middleware; a lower number comes from another publisher."""
-        before, last = self._sequence
-        if sequence is not None and last is not None and kind is before and sequence > last:
-            self._drop(sequence - last - 1)
-        self._sequence = kind, sequence
-
-    def _detect(self, job: tuple[Callable[[], Frame], Header]) -> DetectedFrame:
+    def _detect(self, job: tuple[Callable[[], Frame], Header]) -> tuple[Frame, DetectedFrame]:
         """Find the stars of a frame, in the worker's thread."""
         # The CPU time of this thread alone: others may draw or render meanwhile.
         begin, cpu = time.monotonic(), time.thread_time()
@@ -355,30 +332,25 @@ class DetectorNode(Node):
         # The stamp must be the frame's to the nanosecond, because others match messages by it.
         message.header = header
         cpu_ms = (time.thread_time() - cpu) * 1e3
-        return DetectedFrame(frame, message, detection, cpu_ms, time.monotonic() - begin)
+        return frame, DetectedFrame(message, detection, cpu_ms, time.monotonic() - begin)
 
     def _on_wake(self) -> None:
         for result in self._worker.fetch():
-            if isinstance(result, DetectedFrame):
-                self._publisher.publish(result.message)
-                self._frames += 1
-                self._troubles.right("frames")
-                if result.frame is not None:
-                    width, height = result.frame.width, result.frame.height
-                    self._sizes.say(f"frames of {width} x {height} px, {encoding_of(result.frame)}.", True)
-                    if self._day is not None:
-                        self._day.judge(result.frame, result.detection.stars.disc)
-                    subject = result.frame, result.detection.stars, result.message.header
-                    self._annotator.offer(*subject)
-                    if self._trail_finder is not None:
-                        self._trail_finder.offer(*subject)
-                self._last = replace(result, frame=None)
-            elif isinstance(result, StarposError):
-                self._complain(str(result))
-            else:
-                # A defect loses only this frame; the node goes on.
-                kind = type(result).__name__
-                self._complain(f"a frame was given up ({kind}: {result}); keep it and report this.")
+            if isinstance(result, Exception):
+                self._complain(failure_of_frame(result))
+                continue
+            frame, found = result
+            message, stars = found.message, found.detection.stars
+            self._last = found
+            self._publisher.publish(message)
+            self._frames += 1
+            self._troubles.right("frames")
+            self._sizes.say(f"frames of {frame.width} x {frame.height} px, {encoding_of(frame)}.", True)
+            if self._day is not None:
+                self._day.judge(frame, stars.disc)
+            self._annotator.offer(frame, stars, message.header)
+            if self._trail_finder is not None:
+                self._trail_finder.offer(frame, stars, message.header)
         self._go_on()
 
     def _complain(self, sentence: str) -> None:

@@ -12,7 +12,7 @@ from starpos.frames.frame import Frame
 from starpos.messages.stamp import stamp_to_unix
 from starpos.system_clock import StepWatch
 from starpos_camera.sources.source import CapturedFrame, CaptureError
-from starpos_camera.sources.timing import in_one_time
+from starpos_camera.sources.timing import check_one_time
 from starpos_interfaces.msg import Capture
 from starpos_testing.lacking import lacks
 
@@ -88,15 +88,15 @@ def test_a_frame_during_which_the_clock_was_set_is_left_out_unless_its_time_is_i
         clocks[1] += seconds
 
     def take(source):
-        def capture():
-            go(0.3, step)
-            # The diagnostics ask once a second.
-            for _ in range(int(exposure_s)):
-                watch.step_s()
-                go(1.0)
-            return CapturedFrame(Frame(np.zeros((4, 4), np.uint8), mid_unix_s=1.8e9), source)
-
-        return in_one_time(capture, watch)
+        before_s = watch.set_s()
+        go(0.3, step)
+        # The diagnostics ask once a second.
+        for _ in range(int(exposure_s)):
+            watch.step_s()
+            go(1.0)
+        frame = CapturedFrame(Frame(np.zeros((4, 4), np.uint8), mid_unix_s=1.8e9), source)
+        check_one_time(frame, watch.set_s() - before_s)
+        return frame
 
     assert take(Capture.FILE).frame.width == 4
     if step:

@@ -10,6 +10,8 @@ from attempts import made
 from starpos.detection import detect
 from starpos.errors import FrameError
 from starpos.frames.exposure import UNKNOWN_LATENCY_S
+from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import focal_px_of
 from starpos.simulation.scene import expose
 from starpos.sky.catalogue import load_catalogue
 from starpos_camera.sources.registry import SOURCES
@@ -102,7 +104,11 @@ def test_simulated_stars_are_where_starpos_says(scene):
     exposure = make(**SMALL).capture(SETTINGS)
     frame = exposure.frame
     assert frame.mid_unix_s == NOW_S - 0.25 and frame.exposure_s == 0.5
-    assert exposure.stamp_source == Capture.SIMULATED and exposure.camera == scene.camera
+    assert exposure.stamp_source == Capture.SIMULATED
+    # the ideal camera that the node publishes while it has no calibration
+    given = values(**SMALL)
+    focal_px = focal_px_of(given["focal_mm"], given["pixel_um"])
+    assert Camera.from_focal(frame.width, frame.height, focal_px) == scene.camera
     truth = expose(scene, load_catalogue(), NOW_S - 0.5, 0.5, np.random.default_rng(9)).middle
     stars = detect(frame).stars
     assert len(stars) >= 10

@@ -61,16 +61,11 @@ static void poll_commands(void)
     bool done = true;
     if (!length)
         return;
-    switch (frame_check(line, length)) {
-    case FRAME_GOOD:
+    enum frame_error error = frame_check(line, length);
+    if (error == FRAME_GOOD)
         done = obey(line, length - 5);
-        break;
-    case FRAME_WRONG_CRC:
+    else if (error == FRAME_WRONG_CRC)
         done = send_refusal(WRONG_CRC);
-        break;
-    case FRAME_NONE:
-        break;
-    }
     if (done) // otherwise again, once there is room for the answer
         uart_command_done();
 }

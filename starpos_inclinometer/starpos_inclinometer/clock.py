@@ -129,8 +129,6 @@ class ArrivalFilter:
     """
 
     def __init__(self) -> None:
-        # How often the filter started again; its first sample makes it 0.
-        self.restarts = -1
         self._points: deque[tuple[float, float]] = deque(maxlen=MAX_POINTS)
         self._last_ms = 0
         self._last_arrival_s = 0.0
@@ -232,7 +230,6 @@ class ArrivalFilter:
             self._points.popleft()
 
     def _start(self, milliseconds: int, arrival_s: float) -> None:
-        self.restarts += 1
         self._last_ms, self._last_arrival_s, self._time = milliseconds, arrival_s, 0.0
         self._level, self._slope = arrival_s, 0.0
         self._points.clear()

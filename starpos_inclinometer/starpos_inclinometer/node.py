@@ -15,7 +15,7 @@ from starpos.session.driver import Changes
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_simulated
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher
-from starpos_inclinometer.clock import HostClock
+from starpos_inclinometer.clock import HostClock, Step
 from starpos_inclinometer.sources.registry import SOURCES
 from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings
 from starpos_interfaces.msg import Pulse, Tilt
@@ -41,8 +41,8 @@ class Reporter:
         for name, bit in FLAGS.items():
             self._flags[name] += bool(flags & bit)
 
-    def report(self, health: Health, now_s: float) -> Diagnosis:
-        """Make the report of a source; now_s is monotonic."""
+    def report(self, health: Health, step: Step | None, now_s: float) -> Diagnosis:
+        """Make the report of a source; step: the last one of the host's clock; now_s is monotonic."""
         counts, before, self._counts = health.counts, self._counts, health.counts
         flags, self._flags = self._flags, Counter()
         samples, self._samples = self._samples, 0
@@ -52,7 +52,6 @@ class Reporter:
             for name in ("crc_errors", "malformed", "lost", "implausible")
         )
         level, text = Level.OK, health.sentence
-        step = health.step
         if health.phase is not Phase.RECEIVING:
             level = Level.WARN if health.phase is Phase.MOVING else Level.ERROR
         elif flags["stuck"]:
@@ -144,11 +143,11 @@ class InclinometerNode(Node):
 
     def _log(self, health: Health) -> bool:
         """Log a line for each change; return whether there was one."""
-        good, step = health.phase is Phase.RECEIVING, health.step
+        good, step = health.phase is Phase.RECEIVING, self.host_clock.step
         changed = self._phases.say(health.sentence, good, (health.phase, health.sentence))
         return (step is not None and self._steps.say(step_sentence(step.seconds), False, step)) or changed
 
     def _report(self) -> Diagnosis:
         health = self._source.health()
         self._log(health)
-        return self._reporter.report(health, time.monotonic())
+        return self._reporter.report(health, self.host_clock.step, time.monotonic())

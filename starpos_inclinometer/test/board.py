@@ -57,7 +57,8 @@ class Board:
         )
         self.path = self.process.stdout.readline().strip()
         assert self.path, self.process.communicate()[1]
-        self.parser, self.continuity = LineParser(), Continuity()
+        self.parser = LineParser()
+        self.continuity = Continuity(self.parser.counts)
         self._host = None
         self._read = self._written = 0
 

@@ -167,7 +167,7 @@ def test_lines_of_any_end_in_any_pieces():
         lines = TextLines()
         got = [t for k in range(0, len(stream), size) for t in lines.split(stream[k : k + size])]
         assert got == ["1,2", "3,4", "5,6", "7,8", "9,10"]
-        assert lines.garbage_bytes == 1000 and len(lines._rest) <= MAX_LINE
+        assert lines.counts.garbage_bytes == 1000 and len(lines._rest) <= MAX_LINE
 
 
 def test_what_comes_first_on_a_new_connection_may_be_half_a_line():

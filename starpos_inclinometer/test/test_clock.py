@@ -9,8 +9,18 @@ from starpos_inclinometer.clock import ArrivalFilter, PaceWatch
 LATENCY_S = 0.031
 
 
+class Watched(ArrivalFilter):
+    """A filter that counts how often it starts again; its first sample makes it 0."""
+
+    restarts = -1
+
+    def _start(self, *sample):
+        self.restarts += 1
+        super()._start(*sample)
+
+
 def stamps(ms, arrivals, clock=None):
-    clock = clock or ArrivalFilter()
+    clock = clock or Watched()
     late = [clock.delay(int(m), float(a)) for m, a in zip(ms, arrivals, strict=True)]
     # NaN where it is not known.
     return np.asarray(arrivals) - np.array(late, float) - LATENCY_S, clock
@@ -74,7 +84,7 @@ def test_a_reset_starts_anew():
 
 def test_a_clock_that_stood_still_is_noticed_once_samples_come_at_their_pace_again():
     """The MCU was reset while the cable was out and its clock is ahead, but not enough; or it stood still."""
-    clock = ArrivalFilter()
+    clock = Watched()
     for i in range(50):
         clock.delay(100 * i, 10 + 0.1 * i)
     told = [clock.delay(9000 + 100 * i, 75 + 0.1 * i) for i in range(20)]
@@ -125,7 +135,7 @@ def test_a_process_that_stands_again_while_it_reads_its_backlog_dates_it_rightly
 
 
 def test_a_reset_within_a_stall_is_not_dated_before_the_clocks_have_kept_their_relation():
-    clock = ArrivalFilter()
+    clock = Watched()
     for i in range(150):
         clock.delay(100 * i, 10 + 0.1 * i)
     # Booted at 25, read at 30.
@@ -184,7 +194,7 @@ def test_a_stall_makes_lateness_not_another_clock():
 
 def test_delays_are_never_negative_and_never_raise():
     rng = np.random.default_rng(7)
-    clock = ArrivalFilter()
+    clock = Watched()
     for ms, arrival in zip(rng.integers(0, 2**32, 5000), np.cumsum(rng.random(5000)), strict=True):
         delay = clock.delay(int(ms), float(arrival))
         assert delay is None or delay >= 0.0

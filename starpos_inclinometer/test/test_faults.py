@@ -269,8 +269,9 @@ class Taken:
     def __init__(self, path, now_ns=time.time_ns, **parameters):
         self.readings = []
         self._come = threading.Event()
-        clock = HostClock(now_ns)
-        self.source = McuSource(Surroundings(None, clock, self._come.set), values(port=path, **parameters))
+        self.clock = HostClock(now_ns)
+        host = Surroundings(None, self.clock, self._come.set)
+        self.source = McuSource(host, values(port=path, **parameters))
         self.source.start()
 
     def until(self, condition):
@@ -314,11 +315,11 @@ def test_host_clock_stepped(wire, tell, step_s):
     taken = Taken(wire.path, lambda: time.time_ns() + round(ahead_s[0] * 1e9), rate=50)
     try:
         taken.until(lambda: len(dated(taken)) >= 60)
-        assert taken.source.health().step is None
+        assert taken.clock.step is None
         ahead_s[0] = step_s
         n = len(dated(taken))
         taken.until(lambda: len(dated(taken)) >= n + 60)
-        health = taken.source.health()
+        health, step = taken.source.health(), taken.clock.step
     finally:
         taken.source.stop()
     steps = np.diff([r.stamp_ns for r in dated(taken)[-120:]]) * 1e-9
@@ -327,14 +328,14 @@ def test_host_clock_stepped(wire, tell, step_s):
     assert np.abs(np.delete(steps, largest) - 0.02).max() < 0.03
     assert np.diff([r.sequence for r in taken.readings]).tolist() == [1] * (len(taken.readings) - 1)
     assert {r.flags for r in dated(taken)} == {0}
-    assert health.phase is Phase.RECEIVING and health.step.seconds == pytest.approx(step_s, abs=0.01)
+    assert health.phase is Phase.RECEIVING and step.seconds == pytest.approx(step_s, abs=0.01)
     reporter = Reporter()
-    during = reporter.report(health, health.step.monotonic_s + 29)
-    after = reporter.report(health, health.step.monotonic_s + 31)
+    during = reporter.report(health, step, step.monotonic_s + 29)
+    after = reporter.report(health, step, step.monotonic_s + 31)
     assert (during.level, after.level) == (1, 0) and f"{step_s:+.3f} s" in during.message
     tell(
         f"host's clock stepped by {step_s:+.0f} s",
-        f"told as {health.step.seconds:+.3f} s; stamps of the new time from the next sample on, "
+        f"told as {step.seconds:+.3f} s; stamps of the new time from the next sample on, "
         f"each {np.delete(steps, largest).mean() * 1e3:.1f} ms after the one before",
     )
 

@@ -126,7 +126,7 @@ def test_takes_the_samples_of_its_rate(board, rate_hz):
     steps = np.diff([s.milliseconds for s in got])
     assert np.abs(steps - 1000 / rate_hz).max() < 1
     assert steps.sum() == pytest.approx(1000 / rate_hz * len(steps), abs=1)
-    assert [s.status for s in got[1:]] == [0] * (len(got) - 1) and board.continuity.lost == 0
+    assert [s.status for s in got[1:]] == [0] * (len(got) - 1) and board.parser.counts.lost == 0
     assert len(data) <= mcu_protocol.SAMPLE_LINE * (rate_hz * seconds + 1)
     sent_ms = board.tell("state")["line_ms"]
     assert sent_ms - got[-1].milliseconds == pytest.approx(identity.delay_ms, abs=0.3)
@@ -271,8 +271,8 @@ def test_a_reset_in_the_middle_tells_its_cause(board, cause, status):
     assert first.status == status and first.broken
     assert {s.status for s in rest} == {0} and len(rest) >= 10
     assert first.milliseconds < 400
-    parser = board.parser
-    assert (board.continuity.restarts, parser.crc_errors, parser.malformed) == (1, 0, 0)
+    counts = board.parser.counts
+    assert (counts.restarts, counts.crc_errors, counts.malformed) == (1, 0, 0)
 
 
 @pytest.mark.parametrize("left", [2, 1])
@@ -341,7 +341,7 @@ def test_answers_as_the_protocol_says(board, command):
 
     assert plain(got) == plain(said)
     assert any(isinstance(m, Identity) for m in board.messages(100, mcu_protocol.identify_command()))
-    assert board.parser.crc_errors == board.parser.malformed == 0
+    assert board.parser.counts.crc_errors == board.parser.counts.malformed == 0
 
 
 def test_a_line_that_is_too_long_is_dropped_silently(board):
@@ -363,8 +363,8 @@ def test_noise_on_the_line_does_not_stop_it(board):
     assert any(
         isinstance(m, Identity) for m in board.messages(200, b"\r\n" + mcu_protocol.identify_command())
     )
-    parser, continuity = board.parser, board.continuity
-    assert (parser.crc_errors, parser.malformed, continuity.lost, continuity.restarts) == (0, 0, 0, 0)
+    counts = board.parser.counts
+    assert (counts.crc_errors, counts.malformed, counts.lost, counts.restarts) == (0, 0, 0, 0)
 
 
 def test_a_flood_of_commands_costs_whole_samples_and_says_so(board):
@@ -374,9 +374,9 @@ def test_a_flood_of_commands_costs_whole_samples_and_says_so(board):
     for _ in range(10):
         got += board.messages(100, mcu_protocol.identify_command() * 25)
     got += board.messages(500)
-    parser, continuity = board.parser, board.continuity
-    assert (parser.crc_errors, parser.malformed, continuity.restarts) == (0, 0, 0)
-    assert continuity.lost > 0
+    counts = board.parser.counts
+    assert (counts.crc_errors, counts.malformed, counts.restarts) == (0, 0, 0)
+    assert counts.lost > 0
     for sample in samples(got):
         assert bool(sample.status & SampleStatus.OVERRUN) == (sample.lost > 0)
     assert [s.status for s in samples(got)[-10:]] == [0] * 10

@@ -179,7 +179,7 @@ def test_a_hung_mcu_is_reset_and_goes_on(board):
     board.tell("hang")
     first = next(s for s in samples(board.messages(1500)) if s.status & SampleStatus.FIRST)
     assert first.status == SampleStatus.FIRST | SampleStatus.WATCHDOG and first.broken
-    assert (board.parser.crc_errors, board.parser.malformed) == (0, 0)
+    assert (board.parser.counts.crc_errors, board.parser.counts.malformed) == (0, 0)
 
 
 def test_the_claimed_noise_is_that_of_the_readings(board):

@@ -11,6 +11,7 @@ import pytest
 
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import Identity, LineParser, Reason, Refusal, Sample
+from starpos_inclinometer.sources.source import Counts
 from starpos_testing import emulator
 
 PROTOCOL = Path(__file__).parent.parent / "PROTOCOL.md"
@@ -71,7 +72,7 @@ def test_chunks_of_any_size_give_the_same_samples():
         parser = LineParser()
         pieces = [m for i in range(0, len(stream), size) for m in parser.parse(stream[i : i + size])]
         assert pieces == whole
-        assert (parser.good, parser.crc_errors, parser.malformed, parser.garbage_bytes) == (50, 0, 0, 0)
+        assert parser.counts == Counts(good=50)
 
 
 def test_resynchronises_after_garbage_and_counts_it():
@@ -79,7 +80,7 @@ def test_resynchronises_after_garbage_and_counts_it():
     a, b, c = lines(3)
     garbage = b"\x00\xff$T,00*\r\n$$$*"
     assert [m.sequence for m in parser.parse(garbage + a + garbage + b[:20] + c)] == [0, 2]
-    assert (parser.good, parser.garbage_bytes) == (2, 2 * len(garbage) + 20)
+    assert (parser.counts.good, parser.counts.garbage_bytes) == (2, 2 * len(garbage) + 20)
 
 
 def test_a_stray_start_does_not_cost_the_line_after_it():
@@ -102,7 +103,7 @@ def test_wrong_checksum_and_unknown_line_are_counted_and_dropped():
     line = lines(1)[0]
     assert parser.parse(line.replace(b"800000", b"800001")) == []
     assert parser.parse(mcu_protocol.frame(b"Z,01") + mcu_protocol.frame(b"T,1,2,3")) == []
-    assert (parser.good, parser.crc_errors, parser.malformed) == (0, 1, 2)
+    assert (parser.counts.good, parser.counts.crc_errors, parser.counts.malformed) == (0, 1, 2)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +120,7 @@ def test_wrong_checksum_and_unknown_line_are_counted_and_dropped():
 )
 def test_right_checksum_but_impossible_fields_are_no_message(body):
     parser = LineParser()
-    assert parser.parse(mcu_protocol.frame(body)) == [] and parser.malformed == 1
+    assert parser.parse(mcu_protocol.frame(body)) == [] and parser.counts.malformed == 1
 
 
 def test_random_bytes_never_raise_and_give_nothing():
@@ -129,7 +130,7 @@ def test_random_bytes_never_raise_and_give_nothing():
     for data in (rng.integers(0, 256, 100_000, np.uint8), rng.choice(alphabet, 100_000)):
         for chunk in np.array_split(data, 777):
             assert parser.parse(chunk.tobytes()) == []
-    assert parser.garbage_bytes > 190_000
+    assert parser.counts.garbage_bytes > 190_000
 
 
 @pytest.mark.parametrize("share", [0.001, 0.01, 0.05])
@@ -146,7 +147,7 @@ def test_flipped_bits_never_make_a_wrong_sample(share):
         assert line == truth[s.sequence]
     clean = sum(not line.any() for line in flips.reshape(len(sent), -1))
     assert clean <= len(samples) <= clean + 3
-    assert parser.crc_errors > 0
+    assert parser.counts.crc_errors > 0
 
 
 def test_every_single_and_double_bit_error_in_a_line_is_found():

@@ -78,7 +78,7 @@ def test_an_edge_beside_the_end_of_a_millisecond_costs_none(board):
             time_ms(closed) - off_ms - now_ms - after_ms,
             time_ms(opened) - off_ms - now_ms - after_ms - 20,
         ]
-    assert np.abs(errors).max() < 0.003 and board.parser.malformed == 0
+    assert np.abs(errors).max() < 0.003 and board.parser.counts.malformed == 0
 
 
 def test_a_receivers_second_is_timed_beside_samples_and_shutter(board):
@@ -95,7 +95,7 @@ def test_a_receivers_second_is_timed_beside_samples_and_shutter(board):
     shutter = [p for p in pulses(got) if p.input == Input.SHUTTER]
     assert time_ms(shutter[0]) == pytest.approx(time_ms(seconds[0]), abs=0.02) and len(shutter) == 2
     assert sum(isinstance(m, Sample) and not m.status for m in got) >= 34
-    assert (board.parser.crc_errors, board.parser.malformed) == (0, 0)
+    assert (board.parser.counts.crc_errors, board.parser.counts.malformed) == (0, 0)
 
 
 def test_a_strobe_of_microseconds_is_one_edge_each_time(board):
@@ -132,7 +132,7 @@ def test_lines_of_edges_are_read_as_they_are_written():
     ]
     assert parser.parse(b"".join(lines)) == sent
     bad = [b"P,02,00,00,00000000,0000", b"P,00,00,00,00000000,03E8", b"P,0,00,00,00000000,0000"]
-    assert parser.parse(b"".join(map(frame, bad))) == [] and parser.malformed == 3
+    assert parser.parse(b"".join(map(frame, bad))) == [] and parser.counts.malformed == 3
 
 
 class Line:

@@ -12,7 +12,7 @@ from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import Moment, Step
 from starpos_inclinometer.node import Reporter
 from starpos_inclinometer.sources.mcu import McuDecoder
-from starpos_inclinometer.sources.mcu_protocol import Identity, Sample
+from starpos_inclinometer.sources.mcu_protocol import Identity, Sample, frame
 from starpos_inclinometer.sources.source import Arrival, Counts, Health, Phase
 from starpos_testing.emulator import Mcu
 
@@ -24,28 +24,28 @@ def health(phase=Phase.RECEIVING, **more):
 
 
 @pytest.mark.parametrize(
-    ("state", "flags", "level", "text"),
+    ("state", "step", "flags", "level", "text"),
     [
-        (health(), [0, GAP], 0, "as it is"),
-        (health(Phase.ABSENT), [], 2, "as it is"),
-        (health(Phase.SILENT), [STUCK], 2, "as it is"),
-        (health(Phase.GARBLED), [], 2, "as it is"),
-        (health(Phase.MOVING), [], 1, "as it is"),
-        (health(), [0, STUCK, 0], 2, "stuck"),
-        (health(), [SATURATED | OUT_OF_RANGE], 1, "beyond the sensor's range"),
-        (health(), [OUT_OF_RANGE], 1, "beyond the sensor's range"),
-        (health(complaint="refused"), [0], 1, "refused"),
-        (health(step=Step(2.0, 80.0)), [0], 1, "+2.000 s"),
-        (health(step=Step(2.0, 60.0)), [0], 0, "as it is"),
-        (health(counts=Counts(good=90, crc_errors=5, lost=5)), [0], 1, "10 of 100"),
-        (health(counts=Counts(good=97, crc_errors=3)), [0], 0, "as it is"),
+        (health(), None, [0, GAP], 0, "as it is"),
+        (health(Phase.ABSENT), None, [], 2, "as it is"),
+        (health(Phase.SILENT), None, [STUCK], 2, "as it is"),
+        (health(Phase.GARBLED), None, [], 2, "as it is"),
+        (health(Phase.MOVING), None, [], 1, "as it is"),
+        (health(), None, [0, STUCK, 0], 2, "stuck"),
+        (health(), None, [SATURATED | OUT_OF_RANGE], 1, "beyond the sensor's range"),
+        (health(), None, [OUT_OF_RANGE], 1, "beyond the sensor's range"),
+        (health(complaint="refused"), None, [0], 1, "refused"),
+        (health(), Step(2.0, 80.0), [0], 1, "+2.000 s"),
+        (health(), Step(2.0, 60.0), [0], 0, "as it is"),
+        (health(counts=Counts(good=90, crc_errors=5, lost=5)), None, [0], 1, "10 of 100"),
+        (health(counts=Counts(good=97, crc_errors=3)), None, [0], 0, "as it is"),
     ],
 )
-def test_the_worst_is_told(state, flags, level, text):
+def test_the_worst_is_told(state, step, flags, level, text):
     reporter = Reporter()
     for f in flags:
         reporter.count(f)
-    status = reporter.report(state, 100.0)
+    status = reporter.report(state, step, 100.0)
     assert (status.level, text in status.message) == (level, True), status.message
     assert status.values["samples since the last report"] == len(flags)
 
@@ -55,10 +55,17 @@ def test_each_report_counts_what_came_since_the_one_before():
     for f in (STUCK, STUCK | SATURATED, 0):
         reporter.count(f)
     counts = Counts(good=50, crc_errors=50)
-    first = reporter.report(health(counts=counts), 0.0).values
+    first = reporter.report(health(counts=counts), None, 0.0).values
     assert [first[f"of these {n}"] for n in ("stuck", "saturated", "out of range")] == [2, 1, 0]
-    second = reporter.report(health(counts=counts), 1.0)
+    second = reporter.report(health(counts=counts), None, 1.0)
     assert second.level == 0 and second.values["of these stuck"] == 0
+
+
+def test_a_rate_that_the_microcontroller_refuses_is_told():
+    source = mcu_source(VALUES | {"rate": 50})
+    assert source.health().complaint == ""
+    source._decoder.decode(frame(b"N,03"), Moment(0.0, 0))
+    assert "refused 50 Hz" in source.health().complaint
 
 
 def arrival(k, at_s, identity=None, **more):

@@ -75,14 +75,15 @@ def read() -> SystemClock | None:
     return SystemClock(synchronised, max_error_us * 1e-6, est_error_us * 1e-6)
 
 
-def both_clocks() -> tuple[float, float]:
-    """Read UTC and the monotonic clock at one moment (s), again if something delayed the second reading."""
+def both_clocks(now: Callable[[], float] = time.time) -> tuple[float, float]:
+    """Read a clock and the monotonic one at one moment (s), again if something delayed the reading."""
     for _ in range(TRIES):
         before = time.monotonic()
-        utc = time.time()
-        if time.monotonic() - before < QUICK_S:
+        utc = now()
+        after = time.monotonic()
+        if after - before < QUICK_S:
             break
-    return utc, before
+    return utc, (before + after) / 2
 
 
 class StepWatch:

@@ -10,12 +10,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock, ROSClock
-from rclpy.clock_type import ClockType
+from rclpy.clock import ROSClock
 from rclpy.node import Node
 
 from starpos import system_clock
 from starpos.session.driver import Diagnosis, Level
+from starpos_common.topics import steady_timer
 
 __all__ = ["Diagnosis", "Diagnostics", "Level"]
 
@@ -38,8 +38,7 @@ class Diagnostics:
         self._name = node.get_name() if node.get_namespace() == "/" else node.get_fully_qualified_name()
         self._tasks = dict(tasks)
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(PERIOD_S, self.publish, clock=self._steady)
+        self._timer = steady_timer(node, PERIOD_S, self.publish)
 
     def publish(self) -> None:
         """Publish at once, for a change that should not wait for the timer."""

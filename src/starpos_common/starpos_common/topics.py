@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers and subscriptions: QoS that the user may override, a driver's reliability, lost messages, other publishers.
+"""Topics and timers: QoS that the user may override, a driver's reliability, lost messages, other publishers.
 
 The QoS of each topic is in the parameters `qos_overrides.TOPIC...`.
 """
@@ -10,12 +10,15 @@ from contextlib import contextmanager
 from typing import Any
 
 from rclpy._rclpy_pybind11 import RCLError
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QosCallbackResult, QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from starpos.parameters.table import ParameterError
@@ -108,7 +111,15 @@ def _overridden(node: Node, topic: str) -> Iterator[None]:
         raise ParameterError(f"{name}: {error}.") from None
 
 
+def steady_timer(node: Node, period_s: float, call: Callable[[], object], autostart: bool = True) -> Timer:
+    """Make a timer of real time, which goes on while simulated time stands still or the system's clock is set back."""
+    steady = Clock(clock_type=ClockType.STEADY_TIME)
+    return node.create_timer(period_s, call, clock=steady, autostart=autostart)
+
+
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+# how often publishers are compared with a subscription
+LOOK_S = 0.5
 # maximum number of publishers and topics named in a sentence
 MAX_NAMED = 3
 
@@ -132,20 +143,22 @@ class MatchedSubscription:
         self._fixed = self._qos.reliability != RELIABLE
         package = kind.__module__.partition(".")[0]
         self._type = f"{package}/msg/{kind.__name__}"
+        self._look()
+        self._timer = steady_timer(node, LOOK_S, self._look)
 
     @property
     def publishers(self) -> list[TopicEndpointInfo]:
         """The publishers of this topic and type that the graph shows."""
         return [p for p in self._offered() if p.topic_type == self._type]
 
-    def look(self) -> None:
+    def _look(self) -> None:
         """Take the reliability that is offered now."""
         offered = {p.qos_profile.reliability for p in self.publishers}
         wanted = BEST_EFFORT if offered == {BEST_EFFORT} else RELIABLE
         if self._fixed or wanted == self._qos.reliability:
             return
         self._qos = QoSProfile(history=self._qos.history, depth=self._qos.depth, reliability=wanted)
-        self.destroy()
+        self._node.destroy_subscription(self._subscription)
         self._subscription = self._node.create_subscription(
             self._kind, self.topic, self._callback, self._qos, event_callbacks=SILENT
         )
@@ -153,6 +166,7 @@ class MatchedSubscription:
         self._node.get_logger().info(f"{self.topic} is heard {how}.")
 
     def destroy(self) -> None:
+        self._node.destroy_timer(self._timer)
         self._node.destroy_subscription(self._subscription)
 
     def unheard(self) -> str:

@@ -11,7 +11,15 @@ from typing import Any
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 
+from starpos.errors import StarposError
 from starpos.session.driver import Jobs, Outcome, outcome_of
+
+
+def failure_of_frame(error: Exception) -> str:
+    """Say what the failure of a frame's job means; a defect loses only that frame, and the node goes on."""
+    if isinstance(error, StarposError):
+        return str(error)
+    return f"a frame was given up ({type(error).__name__}: {error}); keep it and report this."
 
 
 class Worker:

@@ -62,20 +62,25 @@ def text(value: str, letters: int = SENTENCE_LETTERS) -> str:
     return line if len(line) <= letters else line[: letters - 1] + "…"
 
 
+def place_of(latitude: float, longitude: float) -> tuple[float, float] | None:
+    """Latitude and longitude [deg]; None if there is no such place on Earth."""
+    return (latitude, longitude) if abs(latitude) <= 90 and abs(longitude) <= 360 else None
+
+
 def position(message: NavSatFix) -> dict:
     """Place [deg], altitude [m], covariance of (east, north) [m2] as [ee, en, nn]; good: False if it is no fix."""
     told: dict[str, Any] = {"good": False, "trouble": "", "stamp": stamp_to_unix(message.header.stamp)}
-    latitude, longitude = number(message.latitude), number(message.longitude)
+    place = place_of(message.latitude, message.longitude)
     if message.status.status == NavSatStatus.STATUS_NO_FIX:
         return told | {"trouble": "no fix"}
-    if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 360:
+    if place is None:
         return told | {"trouble": "the position is not on Earth: it is not shown"}
     covariance = _covariance(message)
     return told | {
         "good": True,
         "trouble": "" if covariance else "its error is not known",
-        "latitude": latitude,
-        "longitude": math.remainder(longitude, 360.0),
+        "latitude": place[0],
+        "longitude": math.remainder(place[1], 360.0),
         "altitude": number(message.altitude),
         "covariance": covariance,
     }
@@ -124,13 +129,12 @@ def gnss(message: GnssCheck) -> dict | None:
     """Place [deg] of GNSS, and its comparison with the stars; None for an unknown status."""
     if message.status not in GNSS_WORDS:
         return None
-    latitude, longitude = number(message.latitude), number(message.longitude)
-    on_earth = latitude is not None and longitude is not None and max(abs(latitude), abs(longitude) / 4) <= 90
+    latitude, longitude = place_of(message.latitude, message.longitude) or (None, None)
     return {
         "status": GNSS_WORDS[message.status],
         "sentence": text(message.status_text),
-        "latitude": latitude if on_earth else None,
-        "longitude": longitude if on_earth else None,
+        "latitude": latitude,
+        "longitude": longitude,
         "stamp": stamp_to_unix(message.header.stamp),
     }
 
@@ -273,11 +277,10 @@ class Board:
         """Keep the known place that a solver reports, from which the Sun is shown before any fix."""
         told = {v.key: v.value for v in status.values[:STATUSES]}
         try:
-            latitude, longitude = (float(told[key]) for key in (SITE_LATITUDE, SITE_LONGITUDE))
+            place = place_of(float(told[SITE_LATITUDE]), float(told[SITE_LONGITUDE]))
         except (KeyError, ValueError):
             return
-        if abs(latitude) <= 90 and abs(longitude) <= 360:
-            self._site = latitude, longitude
+        self._site = place or self._site
 
     def _sun(self, now_s: float) -> list[list[float]] | None:
         """The Sun's way at the newest place, of the stars or of GNSS, or at a known one; None without any."""

@@ -8,8 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image, Imu, NavSatFix
@@ -20,7 +18,7 @@ from starpos.messages.stamp import stamp_to_unix
 from starpos.parameters.table import parameters_of
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.parameters import declare
-from starpos_common.topics import subscription
+from starpos_common.topics import steady_timer, subscription
 from starpos_dashboard import board, server
 from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
@@ -96,8 +94,7 @@ class DashboardNode(Node):
         self.create_subscription(DiagnosticArray, "/diagnostics", self._board.hear_diagnostics, 50)
         # Subscribe once now, so that a wrong qos_override is refused at the start.
         self.destroy_subscription(self._subscribe_frames())
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(1 / self._values["rate"], self._tell, clock=steady)
+        self._timer = steady_timer(self, 1 / self._values["rate"], self._tell)
         self._diagnostics = Diagnostics(self, {"Page": self._report})
 
     def _announce(self, address: str) -> None:

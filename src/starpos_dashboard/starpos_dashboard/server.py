@@ -281,11 +281,8 @@ class Reply(RequestHandler):
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(f"{status_code}: {self._reason}\n")
 
-    async def deliver(self) -> bool:
-        """Send what was written; False if the other side is gone, or takes too long and is closed."""
-        return await self._sent(self.flush())
-
-    async def _sent(self, sending: Awaitable[None]) -> bool:
+    async def sent(self, sending: Awaitable[None]) -> bool:
+        """Wait for what is sent; False if the other side is gone, or takes too long and is closed."""
         with suppress(StreamClosedError):
             try:
                 await asyncio.wait_for(sending, PATIENCE_S)
@@ -299,7 +296,7 @@ class Reply(RequestHandler):
     async def send(self, kind: str, content: bytes) -> None:
         """Send the whole reply; 304 if the browser has it already."""
         self.set_header("Content-Type", kind)
-        await self._sent(self.finish(content))
+        await self.sent(self.finish(content))
 
 
 class File(Reply):
@@ -346,7 +343,7 @@ class Events(Reply):
             return
         self.server.open.add(self)
         try:
-            while await self.deliver():
+            while await self.sent(self.flush()):
                 await self.news.wait()
                 self.news.clear()
                 self._write_news()

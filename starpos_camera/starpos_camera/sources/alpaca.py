@@ -25,7 +25,6 @@ from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSe
 from starpos_camera.sources.timing import check_exposed, clock_stddev_of, dated_by_driver
 
 T = TypeVar("T")
-DEFAULT_EXPOSURE_S = 0.5
 # From the end of an exposure to its picture; slow CCDs take 15 s.
 READOUT_S = 20.0
 POLL_S = 0.02
@@ -218,25 +217,23 @@ class Alpaca(DeviceSource[AlpacaCamera]):
         # Another program may have disconnected the camera.
         if not camera.get("connected"):
             camera = self._device = self._open()
-        wanted_s = settings.exposure_s or DEFAULT_EXPOSURE_S
+        wanted_s = settings.definite_exposure_s
         remark = self._set_gain(camera, settings.gain)
         commanded_s = self._now()
         camera.put("startexposure", Duration=wanted_s, Light=True)
         self._wait(camera, wanted_s)
-        ready_s = self._now()
+        between_s = commanded_s, self._now()
         exposure_s = camera.optional("lastexposureduration", wanted_s)
         # before a picture is fetched that cannot be dated
-        check_exposed(exposure_s, wanted_s, (commanded_s, ready_s))
+        check_exposed(exposure_s, wanted_s, between_s)
         pixels = camera.picture(*self._size)
         told = camera.optional("lastexposurestarttime", "")
         clock_s = clock_stddev_of("alpaca", self._address.rpartition(":")[0], self._values)
-        frame, exposures_s = Frame(_unsigned(pixels), pattern=self._pattern), (exposure_s, wanted_s)
-        taken = dated_by_driver(frame, told, clock_s, exposures_s, (commanded_s, ready_s), self._values)
+        frame = Frame(_unsigned(pixels), pattern=self._pattern, exposure_s=exposure_s)
+        taken = dated_by_driver(frame, told, clock_s, between_s, self._values)
         return replace(taken, remark=taken.remark or remark)
 
     def _explain(self, error: Exception) -> str:
-        if isinstance(error, CaptureError):
-            return str(error)
         if isinstance(error, TimeoutError):
             return "it does not answer in time; check the server and the network."
         if isinstance(error, (OSError, HTTPException)):

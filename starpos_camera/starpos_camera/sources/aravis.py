@@ -15,7 +15,7 @@ from string import digits
 from types import ModuleType
 from typing import Any
 
-from starpos.errors import StarposError, one_line
+from starpos.errors import one_line
 from starpos.frames.encodings import MOSAICS
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import MAX_PIXELS, Frame
@@ -164,9 +164,6 @@ class AravisCamera:
             "" if abs(told - wanted) <= 0.01 * max(1.0, wanted) else f"its gain is {told:g}, not {wanted:g}."
         )
 
-    def trigger(self) -> None:
-        self.camera.software_trigger()
-
     def drain(self) -> None:
         """Leave out the frames that came before."""
         while (buffer := self._stream.try_pop_buffer()) is not None:
@@ -314,8 +311,6 @@ class Aravis(DeviceSource[AravisCamera]):
 
     def _explain(self, error: Exception) -> str:
         # Aravis reports everything as GLib.Error, and a camera's strange answers cause others.
-        if isinstance(error, StarposError):
-            return str(error)
         words = one_line(getattr(error, "message", error)).rstrip(".")
         return f"{words or type(error).__name__}; check its cable, its power, and programs that hold it."
 
@@ -326,7 +321,7 @@ class Aravis(DeviceSource[AravisCamera]):
         camera.drain()
         asked_s, commanded_s = time.time(), self._now()
         if triggers:
-            camera.trigger()
+            camera.camera.software_trigger()
         frame, camera_s, arrival_s = self._wait(camera, asked_s, exposure_s)
         # The arrival by the node's clock, which need not be the system's.
         received_s = self._now() - (time.time() - arrival_s)

@@ -158,9 +158,14 @@ class Gphoto2Camera:
             raise CaptureError(f"{path} came with {len(data)} of its {size} bytes.")
         return data
 
-    def delete(self, files: list[str]) -> None:
-        for path in map(PurePosixPath, files):
-            self._camera.file_delete(str(path.parent), path.name)
+    def delete(self, files: list[str]) -> str:
+        """Delete the files of an exposure in the camera; return a sentence if that failed, otherwise ''."""
+        try:
+            for path in map(PurePosixPath, files):
+                self._camera.file_delete(str(path.parent), path.name)
+        except self._gp.GPhoto2Error as error:
+            return f"frames stay in the camera, which fills up ({error.string})."
+        return ""
 
 
 def _find_camera(model: str, port: str) -> tuple[str, str]:
@@ -246,7 +251,7 @@ class Gphoto2(DeviceSource[Gphoto2Camera]):
     def _explain(self, error: Exception) -> str | None:
         import gphoto2
 
-        return sentence(error.code) if isinstance(error, gphoto2.GPhoto2Error) else super()._explain(error)
+        return sentence(error.code) if isinstance(error, gphoto2.GPhoto2Error) else None
 
     def _open(self) -> Gphoto2Camera:
         """Open the camera and make the settings that hold as long as it is open."""
@@ -270,7 +275,7 @@ class Gphoto2(DeviceSource[Gphoto2Camera]):
         files = camera.files(set_s)
         file = next((f for f in files if PurePosixPath(f).suffix.lower() in RAW), files[0])
         data = camera.fetch(file)
-        remark = "" if self._values["gphoto2.keep"] else self._delete(camera, files)
+        remark = "" if self._values["gphoto2.keep"] else camera.delete(files)
         frame = decode_frame(data, file)
         exposure_s = set_s if frame.exposure_s is None else frame.exposure_s
         if abs(math.log(exposure_s / set_s)) > TOLERANCE:
@@ -278,16 +283,6 @@ class Gphoto2(DeviceSource[Gphoto2Camera]):
         taken = dated_by_command(replace(frame, exposure_s=exposure_s), commanded_s, self._values)
         stddev_s = math.hypot(taken.frame.stamp_stddev_s, named_off_s(exposure_s) / 2)
         return replace(taken, frame=replace(taken.frame, stamp_stddev_s=stddev_s), remark=remark)
-
-    def _delete(self, camera: Gphoto2Camera, files: list[str]) -> str:
-        """Delete the files of this exposure in the camera; return a sentence if that failed, otherwise ''."""
-        import gphoto2
-
-        try:
-            camera.delete(files)
-        except gphoto2.GPhoto2Error as error:
-            return f"frames stay in the camera, which fills up ({error.string})."
-        return ""
 
 
 def named_off_s(exposure_s: float) -> float:

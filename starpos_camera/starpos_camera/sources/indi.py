@@ -11,14 +11,14 @@ import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from starpos.errors import one_line
 from starpos.frames.fits import read_fits
 from starpos.frames.frame import MAX_PIXELS
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource
-from starpos_camera.sources.timing import clock_stddev_of, dated_by_driver
+from starpos_camera.sources.timing import check_exposed, clock_stddev_of, dated_by_driver
 
 # A server that has gone is noticed after two of these.
 BEAT_S = 0.5
@@ -367,9 +367,6 @@ def _check_limits(device: IndiDevice, vector: str, member: str, value: float, na
         raise CaptureError(f"its {name} is {low:g} to {high:g}, not {value:g}.")
 
 
-DEFAULT_EXPOSURE_S = 0.5
-
-
 class Indi(DeviceSource[IndiDevice]):
     """Takes whole light frames as FITS. Connects the device if need be; aborts an exposure that is given up."""
 
@@ -393,7 +390,7 @@ class Indi(DeviceSource[IndiDevice]):
         return IndiDevice(self._host, self._port, self._name, self._closing)
 
     def _expose(self, device: IndiDevice, settings: CaptureSettings) -> CapturedFrame:
-        exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
+        exposure_s = settings.definite_exposure_s
         # What has come since the last frame: perhaps the end of the connection.
         device.until(lambda: False, DRAIN_S)
         if device.lost:
@@ -404,13 +401,15 @@ class Indi(DeviceSource[IndiDevice]):
         set_up(device, exposure_s, settings.gain, self._values["indi.binning"])
         commanded_s = self._now()
         blob = expose(device, exposure_s, self._values["indi.readout"])
-        ready_s = self._now()
+        between_s = commanded_s, self._now()
         frame, header = read_fits(io.BytesIO(_fits_of(blob)), "its frame")
         if frame.untimed:
             raise CaptureError(f"the header of its frame cannot be used: {frame.untimed}.")
+        exposed_s = frame.exposure_s or exposure_s
+        check_exposed(exposed_s, exposure_s, between_s)
+        frame = replace(frame, exposure_s=exposed_s)
         told, clock_s = str(header.get("DATE-OBS", "")), clock_stddev_of("indi", self._host, self._values)
-        exposures_s, between_s = (frame.exposure_s or exposure_s, exposure_s), (commanded_s, ready_s)
-        return dated_by_driver(frame, told, clock_s, exposures_s, between_s, self._values)
+        return dated_by_driver(frame, told, clock_s, between_s, self._values)
 
 
 def _fits_of(blob: ET.Element) -> bytes:

@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,10 +12,6 @@ from starpos.instrument.instrument import focal_px_of
 from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource
 from starpos_interfaces.msg import Capture
 
-if TYPE_CHECKING:
-    from starpos.simulation.scene import Scene
-
-DEFAULT_EXPOSURE_S = 0.5
 # Time and memory of a render grow with the length of the trails.
 MAX_EXPOSURE_S = 10.0
 MAX_PIXELS = 100_000_000
@@ -28,7 +23,7 @@ class Simulated(FrameSource):
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
-        exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
+        exposure_s = settings.definite_exposure_s
         if values["simulated.width"] * values["simulated.height"] > MAX_PIXELS:
             return f"simulated.width times simulated.height must be at most {MAX_PIXELS} px."
         if exposure_s > MAX_EXPOSURE_S:
@@ -51,15 +46,26 @@ class Simulated(FrameSource):
         self.hardware_id = "simulated sky"
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
-        from starpos.simulation.scene import expose, render
+        from starpos.simulation.scene import expose, render, scene_of
         from starpos.sky.catalogue import load_catalogue
 
-        exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
+        values, exposure_s = self._values, settings.definite_exposure_s
         start = self._now() - exposure_s
-        scene = scene_from(dict(self._values))
+        scene = scene_of(
+            size=(values["simulated.width"], values["simulated.height"]),
+            focal_px=focal_px_of(values["focal_mm"], values["pixel_um"]),
+            latitude_deg=values["simulated.latitude"],
+            longitude_deg=values["simulated.longitude"],
+            atmosphere=air_from(values),
+            pointing_deg=(
+                values["simulated.azimuth"],
+                values["simulated.altitude"],
+                values["simulated.roll"],
+            ),
+        )
         stars = expose(scene, load_catalogue(), start, exposure_s, self._rng)
         frame = render(scene, stars, start, exposure_s, self._rng)
-        return CapturedFrame(replace(frame, stamp_stddev_s=STAMP_ROUNDING_S), Capture.SIMULATED, scene.camera)
+        return CapturedFrame(replace(frame, stamp_stddev_s=STAMP_ROUNDING_S), Capture.SIMULATED)
 
 
 def air_from(values: Mapping) -> Atmosphere:
@@ -68,17 +74,4 @@ def air_from(values: Mapping) -> Atmosphere:
         pressure_pa=values["simulated.pressure"],
         temperature_c=values["simulated.temperature"],
         humidity=values["simulated.humidity"],
-    )
-
-
-def scene_from(values: Mapping) -> "Scene":
-    from starpos.simulation.scene import scene_of
-
-    return scene_of(
-        size=(values["simulated.width"], values["simulated.height"]),
-        focal_px=focal_px_of(values["focal_mm"], values["pixel_um"]),
-        latitude_deg=values["simulated.latitude"],
-        longitude_deg=values["simulated.longitude"],
-        atmosphere=air_from(values),
-        pointing_deg=(values["simulated.azimuth"], values["simulated.altitude"], values["simulated.roll"]),
     )

@@ -12,7 +12,6 @@ import numpy as np
 from starpos.errors import StarposError
 from starpos.frames.encodings import ENCODINGS, pixels_of
 from starpos.frames.frame import Frame
-from starpos.instrument.camera import Camera
 
 
 class CaptureError(StarposError):
@@ -40,6 +39,11 @@ class CaptureSettings:
     gain: float | None
     cadence_s: float
 
+    @property
+    def definite_exposure_s(self) -> float:
+        """The exposure, for a source that has none of its own."""
+        return self.exposure_s or 0.5
+
 
 @dataclass(frozen=True, eq=False)
 class CapturedFrame:
@@ -48,13 +52,11 @@ class CapturedFrame:
     frame         with its time: mid_unix_s and stamp_stddev_s are set, clock_stddev_s if another machine gave the time,
                   shutter if anything is known of it
     stamp_source  one of starpos_interfaces/Capture's constants
-    camera        intrinsics that the source knows; None: use the node's
     remark        a sentence about a trouble of the camera although the frame is good; '' for none
     """
 
     frame: Frame
     stamp_source: int
-    camera: Camera | None = None
     remark: str = ""
 
 
@@ -129,7 +131,7 @@ class DeviceSource(FrameSource, Generic[D]):
                 taken = self._expose(self._device, settings)
             except Exception as error:
                 self._release()
-                why = self._explain(error)
+                why = str(error) if isinstance(error, StarposError) else self._explain(error)
                 if why is None:
                     raise
                 raise CaptureError(f"{self.hardware_id}: {why}") from error
@@ -154,8 +156,8 @@ class DeviceSource(FrameSource, Generic[D]):
         raise NotImplementedError
 
     def _explain(self, error: Exception) -> str | None:
-        """Say in a sentence what an error means; None for a defect, which the node reports as one."""
-        return str(error) if isinstance(error, StarposError) else None
+        """Say in a sentence what an error of a library means; None for a defect, which the node reports as one."""
+        return None
 
 
 def decoded(encoding: str, data: bytes, size: tuple[int, int], more: int = 0) -> tuple[np.ndarray, str]:

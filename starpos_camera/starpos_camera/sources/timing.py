@@ -4,14 +4,14 @@
 import math
 import re
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from datetime import datetime, timezone
 from typing import Any
 
+from starpos.errors import TimeError
 from starpos.frames.frame import Frame
 from starpos.messages.stamp import stamp_to_unix
-from starpos.system_clock import StepWatch
+from starpos.units import unix_of
 from starpos_camera.sources.source import CapturedFrame, CaptureError
 from starpos_common.shutter_pulses import Edge, Lag, ShutterPulse, ShutterPulses
 from starpos_interfaces.msg import Capture, Pulse
@@ -51,20 +51,15 @@ def dated_by_driver(
     frame: Frame,
     told: str,
     clock_stddev_s: float,
-    exposures_s: tuple[float, float],
     between_s: tuple[float, float],
     values: Mapping,
 ) -> CapturedFrame:
-    """Date a frame by the better time: the start that the driver reports (`told`, ISO 8601), or the command.
+    """Date a frame, whose exposure is known, by the better time: the driver's start (`told`, ISO 8601), or the command.
 
     clock_stddev_s: of the driver's clock; 0: it is this machine's clock; NaN: unknown, and the start is not used.
-    exposures_s: the exposure that the driver reports, and the one that was asked for.
-    between_s: Unix times of command and arrival. CaptureError by `check_exposed`; a start that does not fit between
-    them is not used.
+    between_s: Unix times of command and arrival. A start that does not fit between them is not used.
     """
-    check_exposed(*exposures_s, between_s)
-    exposure_s, (commanded_s, ready_s) = exposures_s[0], between_s
-    frame = replace(frame, exposure_s=exposure_s)
+    commanded_s, ready_s = between_s
     commanded = dated_by_command(frame, commanded_s, values)
     start = read_utc(told)
     if start is None or math.isnan(clock_stddev_s):
@@ -74,7 +69,7 @@ def dated_by_driver(
     if start_s % 1 == 0:
         resolution_s = 1.0
     tolerance_s = CLOCK_TOLERANCE_S + resolution_s + 3 * clock_stddev_s
-    if max(commanded_s - start_s, start_s + exposure_s - ready_s) > tolerance_s:
+    if max(commanded_s - start_s, start_s + (frame.exposure_s or 0.0) - ready_s) > tolerance_s:
         off = f"its times of exposures are off by more than {tolerance_s:.2g} s and not used"
         return replace(commanded, remark=f"{off}; set its machine's clock, to UTC.")
     started = dated_by_start(frame, start_s, resolution_s, values, clock_stddev_s)
@@ -106,8 +101,8 @@ def read_utc(text: str) -> tuple[float, float] | None:
         return None
     decimals = match[2] or ""
     try:
-        whole = datetime.fromisoformat(match[1]).replace(tzinfo=timezone.utc).timestamp()
-    except ValueError:
+        whole = unix_of(match[1])
+    except TimeError:
         return None
     return whole + float(f"0.{decimals or 0}"), 10.0 ** -len(decimals)
 
@@ -115,20 +110,13 @@ def read_utc(text: str) -> tuple[float, float] | None:
 OF_SYSTEM_CLOCK = (Capture.DRIVER, Capture.COMMAND, Capture.HARDWARE)
 
 
-def in_one_time(capture: Callable[[], CapturedFrame], watch: StepWatch) -> CapturedFrame:
-    """Take a frame with `capture`; CaptureError if the system's clock stamped it and was set meanwhile.
-
-    watch: a StepWatch that another thread asks every second, also during the capture.
-    """
-    before_s = watch.set_s()
-    exposure = capture()
-    step_s = watch.set_s() - before_s
+def check_one_time(exposure: CapturedFrame, step_s: float) -> None:
+    """Raise CaptureError if the system's clock stamped a frame and was set by step_s while it was taken."""
     if step_s and exposure.stamp_source in OF_SYSTEM_CLOCK:
         raise CaptureError(
             f"a frame is left out: the system's clock was set by {step_s:+.3g} s while it was taken, so that its time is "
             "ambiguous."
         )
-    return exposure
 
 
 # How long after a frame its pulse may still be on the serial line.

@@ -21,6 +21,7 @@ import numpy as np
 from starpos.frames.exposure import MAX_READOUT_S, Shutter
 from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos.frames.pictures import quiet_opencv
+from starpos.system_clock import both_clocks
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, decoded
 from starpos_camera.sources.timing import dated
 from starpos_interfaces.msg import Capture
@@ -113,8 +114,7 @@ class Video(DeviceSource["VideoCapture"]):
         return replace(dated(frame, mid_s, stddev_s, stamp), remark=remark)
 
     def _explain(self, error: Exception) -> str:
-        text = str(error) if isinstance(error, CaptureError) else f"{type(error).__name__}: {error}."
-        return " ".join(text.split())
+        return " ".join(f"{type(error).__name__}: {error}.".split())
 
     def _open(self) -> "VideoCapture":
         with quiet_opencv() as cv2:
@@ -195,7 +195,7 @@ class Video(DeviceSource["VideoCapture"]):
         while time.monotonic() < end_s and not self._closing.is_set():
             if not capture.grab():
                 raise CaptureError("it gives no frame; check its plug.")
-            steady_s, now_s = self._clocks()
+            now_s, steady_s = both_clocks(self._now)
             stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             # Drivers stamp with one clock or the other.
             age_s = min(steady_s - stamp_s, time.time() - stamp_s, key=abs)
@@ -217,14 +217,6 @@ class Video(DeviceSource["VideoCapture"]):
         raise CaptureError(
             "it gives frames, but none that was exposed after it was asked for; its clock is wrong."
         )
-
-    def _clocks(self) -> tuple[float, float]:
-        """Read steady time and the node's time (s) within half a millisecond; other threads may delay a reading."""
-        for _ in range(5):
-            before_s, now_s, after_s = time.monotonic(), self._now(), time.monotonic()
-            if after_s - before_s < 1e-3:
-                break
-        return (before_s + after_s) / 2, now_s
 
     def _lag(self, exposure_s: float | None, period_s: float) -> tuple[float, float, float]:
         """Time from an exposure's middle to its stamp, its standard deviation, and the longest from its start (s)."""

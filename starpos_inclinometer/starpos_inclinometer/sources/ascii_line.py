@@ -18,7 +18,7 @@ from starpos_inclinometer.clock import ArrivalFilter, Moment, PaceWatch
 from starpos_inclinometer.sources.mcu_protocol import Gate, clocks_agree
 from starpos_inclinometer.sources.serial_link import SerialLink, port_refusal
 from starpos_inclinometer.sources.source import Arrival, Counts, Surroundings
-from starpos_inclinometer.sources.tilts import SensorTilts, noise_floor_rad
+from starpos_inclinometer.sources.tilts import SensorTilts
 
 # In bytes.
 MAX_LINE = 256
@@ -96,21 +96,10 @@ class LineDecoder:
         self._unit, self._resolution = values["ascii.unit"], values["ascii.resolution"]
         self._request = values["ascii.request"].encode()
         self._lines = TextLines()
-        self._gate = Gate(_follows, NEAR_RAD)
+        self.counts = self._lines.counts
+        self._gate = Gate(_follows, NEAR_RAD, self.counts)
         self._last: Line | None = None
         self._broken = False
-        self._good = self._malformed = self._lost = 0
-
-    @property
-    def counts(self) -> Counts:
-        return Counts(
-            good=self._good,
-            malformed=self._malformed,
-            garbage_bytes=self._lines.garbage_bytes,
-            lost=self._lost,
-            duplicates=self._gate.duplicates,
-            implausible=self._gate.rejected,
-        )
 
     def resume(self) -> None:
         self._lines.forget()
@@ -125,9 +114,9 @@ class LineDecoder:
         for text in self._lines.split(data):
             line = self._parse(text)
             if line is None:
-                self._malformed += 1
+                self.counts.malformed += 1
                 continue
-            self._good += 1
+            self.counts.good += 1
             believed += [
                 Arrival(self._continued(a.sample), a.moment) for a in self._gate.admit(Arrival(line, moment))
             ]
@@ -158,7 +147,7 @@ class LineDecoder:
         if not all(abs(angle) <= FULL_CIRCLE for angle in angles) or math.isinf(temperature):
             return None
         x, y, *z = elevations(np.array(angles)).tolist()
-        number = self._good if sequence is None and milliseconds is None else 0
+        number = self.counts.good if sequence is None and milliseconds is None else 0
         return Line(
             x=x,
             y=y,
@@ -190,7 +179,7 @@ class LineDecoder:
         if ahead < 1:
             # The device was reset, or its number wrapped.
             return replace(line, broken=True)
-        self._lost += ahead - 1
+        self.counts.lost += ahead - 1
         return replace(line, lost=ahead - 1, broken=broken)
 
 
@@ -198,7 +187,7 @@ class TextLines:
     """Collects lines of at most MAX_LINE bytes, ended by CR or LF or both, from chunks of bytes."""
 
     def __init__(self) -> None:
-        self.garbage_bytes = 0
+        self.counts = Counts()
         self._rest = b""
         self._overlong = False
 
@@ -208,12 +197,12 @@ class TextLines:
         lines = []
         for line in ended:
             if self._overlong or len(line) > MAX_LINE:
-                self.garbage_bytes += len(line)
+                self.counts.garbage_bytes += len(line)
                 self._overlong = False
             elif text := line.decode("latin-1").strip():
                 lines.append(text)
         if self._overlong or len(rest) > MAX_LINE:
-            self.garbage_bytes += len(rest)
+            self.counts.garbage_bytes += len(rest)
             self._overlong = True
             rest = b""
         self._rest = rest
@@ -221,7 +210,7 @@ class TextLines:
 
     def forget(self) -> None:
         """Drop a half-received line, because the next bytes come from another connection."""
-        self.garbage_bytes += len(self._rest)
+        self.counts.garbage_bytes += len(self._rest)
         self._rest = b""
         # The first bytes may be the rest of a line.
         self._overlong = True
@@ -256,7 +245,7 @@ class AsciiSource(SerialLink[LineDecoder]):
         range_deg = values["ascii.range"]
         self._tilts.range_rad = math.pi / 2 if math.isnan(range_deg) else math.radians(range_deg)
         self._tilts.stuck = values["ascii.stuck_samples"]
-        self._tilts.noise_floor_rad = noise_floor_rad(values)
+        self._tilts.configure(values)
         self._latency_s = 0.0 if math.isnan(values["latency"]) else values["latency"]
 
     def fetch(self) -> list[Reading]:

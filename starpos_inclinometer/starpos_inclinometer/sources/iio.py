@@ -20,8 +20,8 @@ from starpos_inclinometer.sources.iio_device import (
     find,
     set_sampling_frequency,
 )
-from starpos_inclinometer.sources.source import Arrival, Counts, Health, Link, Phase, Surroundings
-from starpos_inclinometer.sources.tilts import SensorTilts, noise_floor_rad
+from starpos_inclinometer.sources.source import Arrival, Health, Link, Phase, Surroundings
+from starpos_inclinometer.sources.tilts import SensorTilts
 
 PATIENCE_S = 1.0
 # If reading the channels takes longer, this process stood still in between.
@@ -35,15 +35,11 @@ class IioSource(Link):
         self._root, self._wanted = Path(values["iio.root"]), values["iio.device"].strip()
         super().__init__(host, self._wanted or values["iio.root"])
         self._sampling_hz = values["iio.sampling_frequency"]
-        self._good = self._failed = 0
         self.angles, self.forces = SensorTilts(), ImuTilts(values)
         self.unusable = 0
         self.device: IioDevice | None = None
         self._sequence = -1
         self.configure(values)
-
-    def _counts(self) -> Counts:
-        return Counts(good=self._good, malformed=self._failed)
 
     def _serve(self) -> None:
         device = None
@@ -88,14 +84,14 @@ class IioSource(Link):
             good_s = before.monotonic_s
             middle = Moment(before.monotonic_s + took_s / 2, before.host_ns + round(took_s * 5e8))
             with self._lock:
-                self._good += 1
+                self._counts.good += 1
             arrival = Arrival(raw, middle, device, dated=took_s < SLOW_S)
             sentence = f"receiving from {device.model} ({device.folder.name})"
             self._admit([arrival], [middle.monotonic_s], sentence)
 
     def _fail(self, good_s: float, now: Moment, sentence: str) -> None:
         with self._lock:
-            self._failed += 1
+            self._counts.malformed += 1
         if now.monotonic_s - good_s > PATIENCE_S:
             self._enter(Phase.GARBLED, f"{sentence}; it is retried.")
 
@@ -109,7 +105,7 @@ class IioSource(Link):
         self._parameters = values
         self._rate_hz = values["rate"]
         self.angles.stuck = values["iio.stuck_samples"]
-        self.angles.noise_floor_rad = noise_floor_rad(values)
+        self.angles.configure(values)
         self._latency_s = 0.0 if math.isnan(values["latency"]) else values["latency"]
         self.forces.configure(values)
 

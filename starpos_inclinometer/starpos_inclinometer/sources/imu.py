@@ -6,8 +6,6 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
@@ -15,13 +13,10 @@ from starpos.instrument.tilt_log import noise_text
 from starpos.messages.tilt import MIN_MESSAGES, ImuTilts, Reading
 from starpos_common.diagnostics import time_is_simulated
 from starpos_common.topics import MatchedSubscription, subscription
-from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TiltSource
+from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TiltSource, rate_of
 
 TOPIC = "imu/data"
 QUEUE, DEPTH = 512, 1000
-# how often a simulator's publishers are looked at
-LOOK_S = 0.5
-RATE_WINDOW_S = 5.0
 # Stamps that are older when they come are of another clock.
 OLD_S = 5.0
 # A stated standard deviation over the scatter of the messages, from which on it is named as a placeholder.
@@ -44,9 +39,7 @@ class ImuSource(TiltSource):
         self._heard_s = self._told_s = -math.inf
         if time_is_simulated(host.node):
             # of a replay none may be lost; a simulator may offer best effort only
-            matched = MatchedSubscription(host.node, Imu, TOPIC, self._hear, DEPTH)
-            host.node.create_timer(LOOK_S, matched.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
-            self._topic = matched.topic
+            self._topic = MatchedSubscription(host.node, Imu, TOPIC, self._hear, DEPTH).topic
         else:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             self._topic = subscription(host.node, Imu, TOPIC, self._hear, DEPTH, best_effort).topic_name
@@ -76,8 +69,6 @@ class ImuSource(TiltSource):
 
     def health(self) -> Health:
         now_s, tilts = self._clock.read().monotonic_s, self._tilts
-        recent = [t for t in self._recent if now_s - t < RATE_WINDOW_S]
-        rate_hz = (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0
         counts = Counts(good=tilts.good, malformed=tilts.malformed, duplicates=tilts.averager.duplicates)
         values = {
             "messages from the future": tilts.future,
@@ -90,10 +81,9 @@ class ImuSource(TiltSource):
         return Health(
             phase=phase,
             sentence=sentence,
-            rate_hz=rate_hz,
+            rate_hz=rate_of(self._recent, now_s),
             counts=counts,
             complaint=self._complaint(),
-            step=self._clock.step,
             values=values,
         )
 

@@ -30,7 +30,7 @@ from starpos_inclinometer.sources.mcu_protocol import (
     mcu_follows,
 )
 from starpos_inclinometer.sources.serial_link import SerialLink, port_refusal
-from starpos_inclinometer.sources.source import Arrival, Counts, Surroundings
+from starpos_inclinometer.sources.source import Arrival, Health, Surroundings
 from starpos_inclinometer.sources.tilts import (
     BoardSensor,
     Sca100t,
@@ -162,22 +162,9 @@ class McuDecoder:
         self._ask = True
         self._refused_rate: int | None = None
         self._parser = mcu_protocol.LineParser()
-        self._gate = Gate(self._follows, NEAR_CODES[SensorKind.SCA100T])
-        self._continuity = Continuity()
-
-    @property
-    def counts(self) -> Counts:
-        parser, gate, continuity = self._parser, self._gate, self._continuity
-        return Counts(
-            good=parser.good,
-            crc_errors=parser.crc_errors,
-            malformed=parser.malformed,
-            garbage_bytes=parser.garbage_bytes,
-            lost=continuity.lost,
-            duplicates=gate.duplicates,
-            restarts=continuity.restarts,
-            implausible=gate.rejected,
-        )
+        self.counts = self._parser.counts
+        self._gate = Gate(self._follows, NEAR_CODES[SensorKind.SCA100T], self.counts)
+        self._continuity = Continuity(self.counts)
 
     @property
     def period_s(self) -> float:
@@ -223,12 +210,12 @@ class McuDecoder:
         return b""
 
     def _admit(self, arrival: Arrival) -> list[Arrival]:
-        doubts = self._gate.rejected + self._continuity.restarts
+        doubts = self.counts.implausible + self.counts.restarts
         believed = [
             Arrival(self._continuity.follow(a.sample), a.moment, a.identity)
             for a in self._gate.admit(arrival)
         ]
-        if self._gate.rejected + self._continuity.restarts != doubts:
+        if self.counts.implausible + self.counts.restarts != doubts:
             # After a reset the MCU runs at its default rate, perhaps with another firmware; samples that do not fit may
             # come from an unseen reset.
             self._ask = True
@@ -329,10 +316,13 @@ class McuSource(SerialLink[McuDecoder]):
         reading = self.sensor.measure(sample, moment.monotonic_s - late_s, stamp_ns)
         return reading if known_s is not None else replace(reading, flags=reading.flags | TIME_UNKNOWN)
 
-    def _complaint(self) -> str:
+    def health(self) -> Health:
         if not self._decoder.refused:
-            return ""
-        return f"the microcontroller refused {self._decoder.wanted_rate_hz} Hz: set another `rate`."
+            return super().health()
+        return replace(
+            super().health(),
+            complaint=f"the microcontroller refused {self._decoder.wanted_rate_hz} Hz: set another `rate`.",
+        )
 
     def _shown(self) -> Mapping[str, object]:
         identity = self._decoder.identity

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum, IntFlag
 
-from starpos_inclinometer.sources.source import Arrival
+from starpos_inclinometer.sources.source import Arrival, Counts
 
 VERSION = 2
 BAUD = 38400
@@ -157,7 +157,7 @@ class LineParser:
     """Parses and counts the MCU's messages from chunks of bytes; keeps at most one line; never raises, whatever comes."""
 
     def __init__(self) -> None:
-        self.good = self.crc_errors = self.malformed = self.garbage_bytes = 0
+        self.counts = Counts()
         self._rest = b""
 
     def parse(self, data: bytes) -> list[Message]:
@@ -166,26 +166,26 @@ class LineParser:
         buffer = self._rest + data
         end = 0
         for match in _LINE.finditer(buffer):
-            self.garbage_bytes += match.start() - end
+            self.counts.garbage_bytes += match.start() - end
             end = match.end()
             if checksum(match[1]) != int(match[2], 16):
-                self.crc_errors += 1
+                self.counts.crc_errors += 1
             elif (message := _parse(match[1])) is None:
-                self.malformed += 1
+                self.counts.malformed += 1
             else:
-                self.good += 1
+                self.counts.good += 1
                 messages.append(message)
         # A '$' can only be the first byte of a line, so bytes before the last '$' cannot become a line any more.
         start = buffer.rfind(b"$", end)
         if start < 0 or len(buffer) - start >= MAX_LINE:
             start = len(buffer)
-        self.garbage_bytes += start - end
+        self.counts.garbage_bytes += start - end
         self._rest = buffer[start:]
         return messages
 
     def forget(self) -> None:
         """Drop a half-received line, because the next bytes come from another connection."""
-        self.garbage_bytes += len(self._rest)
+        self.counts.garbage_bytes += len(self._rest)
         self._rest = b""
 
 
@@ -256,9 +256,8 @@ class Gate:
     accepted too.
     """
 
-    def __init__(self, follows: Callable[[Arrival, Arrival], bool], tolerance: float) -> None:
-        self.rejected = self.duplicates = 0
-        self._follows = follows
+    def __init__(self, follows: Callable[[Arrival, Arrival], bool], tolerance: float, counts: Counts) -> None:
+        self._follows, self._counts = follows, counts
         self.tolerance = tolerance
         self._change = 0.0
         self._last: Arrival | None = None
@@ -274,16 +273,16 @@ class Gate:
         last, waiting = self._last, self._waiting
         newest = waiting[-1] if waiting else last
         if newest is not None and newest.sample == arrival.sample:
-            self.duplicates += 1
+            self._counts.duplicates += 1
             return []
         if last is not None and self._follows(last, arrival) and self._near(last, arrival):
-            self.rejected += len(waiting)
+            self._counts.implausible += len(waiting)
             return self._believe([arrival])
         if waiting and self._follows(waiting[-1], arrival):
             settled = self._near(waiting[-1], arrival)
             waiting.append(arrival)
             return self._believe(waiting) if settled or len(waiting) == WITNESSES else []
-        self.rejected += len(waiting)
+        self._counts.implausible += len(waiting)
         self._waiting = [arrival]
         return []
 
@@ -337,8 +336,8 @@ def _temperature_leaps(a: Sample, b: Sample) -> bool:
 class Continuity:
     """Continues the sequence numbers over wraps and resets of the MCU, and counts the lost samples."""
 
-    def __init__(self) -> None:
-        self.lost = self.restarts = 0
+    def __init__(self, counts: Counts) -> None:
+        self._counts = counts
         self._last: Sample | None = None
         self._last_raw_sequence = 0
         self._resumed = False
@@ -355,11 +354,11 @@ class Continuity:
             ahead = (sample.sequence - self._last_raw_sequence) & 0xFFFF
             # A serial line keeps the order: a clock that goes back, or a first sample, means a reset.
             if sample.status & SampleStatus.FIRST or elapsed >= 1 << 31:
-                self.restarts += 1
+                self._counts.restarts += 1
                 broken = True
             else:
                 step = ahead or (1 if broken else 1 << 16)
-        self.lost += step - 1
+        self._counts.lost += step - 1
         sequence = sample.sequence if last is None else (last.sequence + step) & 0xFFFFFFFF
         self._last_raw_sequence, self._resumed = sample.sequence, False
         self._last = replace(sample, sequence=sequence, lost=step - 1, broken=broken)

@@ -36,13 +36,12 @@ def port_refusal(values: Mapping[str, Any]) -> str | None:
 
 
 class Decoder(Protocol):
-    """Decodes the bytes of a device and makes its commands. The link's thread uses it; any thread may read `counts`."""
+    """Decodes the bytes of a device and makes its commands. The link's thread uses it."""
 
     # What to do if bytes come but no lines.
     hint: str
 
-    @property
-    def counts(self) -> Counts: ...
+    counts: Counts
 
     @property
     def period_s(self) -> float:
@@ -78,9 +77,7 @@ class SerialLink(Link, Generic[D]):
     def __init__(self, host: Surroundings, values: Mapping[str, Any], decoder: D) -> None:
         super().__init__(host, values["port"])
         self._baud, self._decoder, self._next_command = values["baud"], decoder, 0.0
-
-    def _counts(self) -> Counts:
-        return self._decoder.counts
+        self._counts = decoder.counts
 
     def _serve(self) -> None:
         device = None
@@ -91,7 +88,9 @@ class SerialLink(Link, Generic[D]):
             self._enter(Phase.ABSENT, self._explain(error, opened=device is not None))
         finally:
             if device is not None:
-                _close(device)
+                # If the device is gone there is nothing left to close.
+                with contextlib.suppress(*PORT_ERRORS):
+                    device.close()
 
     def _open(self) -> serial.Serial:
         device = serial.Serial(
@@ -127,7 +126,8 @@ class SerialLink(Link, Generic[D]):
                 self._enter(
                     Phase.SILENT, f"{self.name} is open but silent: check the device's power and cable."
                 )
-                if self._moved(device):
+                # The path may lead to another device now; OSError if it leads nowhere.
+                if os.stat(self.name).st_rdev != os.fstat(device.fileno()).st_rdev:
                     return
             elif now - last_line > patience:
                 self._enter(
@@ -143,19 +143,15 @@ class SerialLink(Link, Generic[D]):
     def _receive(self, data: bytes, moment: Moment) -> tuple[bool, bool]:
         """Take bytes; return whether they held valid lines, and samples."""
         with self._lock:
-            before = self._decoder.counts.good
+            before = self._counts.good
             arrivals = self._decoder.decode(data, moment)
-            lines = self._decoder.counts.good > before
+            lines = self._counts.good > before
         if self._decoder.answered:
             self._next_command = 0.0
         if arrivals:
             samples = [a for a in arrivals if not isinstance(a.sample, mcu_protocol.Pulse)]
             self._admit(arrivals, [moment.monotonic_s] * len(samples), f"receiving from {self.name}")
         return lines, bool(arrivals)
-
-    def _moved(self, device: serial.Serial) -> bool:
-        """Whether the path now leads to another device than the open one; OSError if it leads nowhere."""
-        return os.stat(self.name).st_rdev != os.fstat(device.fileno()).st_rdev
 
     def _explain(self, error: Exception, opened: bool) -> str:
         code = getattr(error, "errno", None)
@@ -169,9 +165,3 @@ class SerialLink(Link, Generic[D]):
             return f"{self.name} is in use by another process: end that one; it is retried."
         text = " ".join(str(error).split())
         return f"{self.name} is no usable serial port ({text}): set `port` to the device; it is retried."
-
-
-def _close(device: serial.Serial) -> None:
-    # If the device is gone there is nothing left to close.
-    with contextlib.suppress(*PORT_ERRORS):
-        device.close()

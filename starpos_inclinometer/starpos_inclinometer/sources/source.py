@@ -6,15 +6,15 @@ A new sensor is a TiltSource in a module here, and a line in `registry`.
 
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
 from rclpy.node import Node
 
 from starpos.messages.tilt import Reading
-from starpos_inclinometer.clock import HostClock, Moment, Step
+from starpos_inclinometer.clock import HostClock, Moment
 from starpos_interfaces.msg import Pulse
 
 # A device that came back is read again within a second.
@@ -38,9 +38,9 @@ class Phase(Enum):
     RECEIVING = "receiving"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class Counts:
-    """Numbers of the lines, or of the messages of a topic, since the source was made."""
+    """Numbers of the lines, or of the messages of a topic, since the source was made; what reads them counts on."""
 
     # Samples with the right checksum and form.
     good: int = 0
@@ -83,8 +83,6 @@ class Health:
     counts: Counts = field(default_factory=Counts)
     # What is wrong although samples come.
     complaint: str = ""
-    # The last step of the host's clock.
-    step: Step | None = None
     values: Mapping[str, object] = field(default_factory=dict)
 
 
@@ -139,6 +137,13 @@ class TiltSource:
         raise NotImplementedError
 
 
+def rate_of(times_s: Iterable[float], now_s: float) -> float:
+    """Rate (Hz) of the samples of the last seconds, by their monotonic times in order."""
+    recent = [t for t in times_s if now_s - t <= RATE_WINDOW_S]
+    span_s = recent[-1] - recent[0] if recent else 0.0
+    return (len(recent) - 1) / span_s if span_s > 0 else 0.0
+
+
 class Link(TiltSource):
     """A source whose device a thread reads until `stop`, and opens again when it comes back.
 
@@ -148,6 +153,7 @@ class Link(TiltSource):
 
     def __init__(self, host: Surroundings, name: str) -> None:
         self.name, self._clock, self._wake = name, host.clock, host.wake
+        self._counts = Counts()
         self._queue: deque[Arrival] = deque(maxlen=QUEUE)
         self._recent: deque[float] = deque(maxlen=QUEUE)
         # Of all that both threads use.
@@ -173,28 +179,17 @@ class Link(TiltSource):
         return arrivals
 
     def health(self) -> Health:
-        shown, complaint = self._shown(), self._complaint()
+        shown = self._shown()
         with self._lock:
-            horizon = self._clock.monotonic_s() - RATE_WINDOW_S
-            recent = [t for t in self._recent if t >= horizon]
-            span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
+            rate_hz = rate_of(self._recent, self._clock.monotonic_s())
             values = {"openings": self._connections, "unfetched samples": self._dropped, **shown}
             return Health(
                 phase=self._phase,
                 sentence=self._sentence,
-                rate_hz=(len(recent) - 1) / span if span > 0 and self._phase is Phase.RECEIVING else 0.0,
-                counts=self._counts(),
-                complaint=complaint,
-                step=self._clock.step,
+                rate_hz=rate_hz if self._phase is Phase.RECEIVING else 0.0,
+                counts=replace(self._counts),
                 values=values,
             )
-
-    def _counts(self) -> Counts:
-        raise NotImplementedError
-
-    def _complaint(self) -> str:
-        """What is wrong although samples come; '' for nothing."""
-        return ""
 
     def _shown(self) -> Mapping[str, object]:
         """What diagnostics show besides the link."""

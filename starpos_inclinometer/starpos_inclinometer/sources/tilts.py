@@ -30,11 +30,6 @@ UNKNOWN_STDDEV_C = 40.0
 SQUARE_AXES = (1.0, 0.0, 0.0, 1.0)
 
 
-def noise_floor_rad(values: Mapping[str, Any]) -> float:
-    """Smallest noise of a reading (rad) by the parameter noise_stddev; 0 where it is unset."""
-    return 0.0 if math.isnan(values["noise_stddev"]) else math.radians(values["noise_stddev"])
-
-
 class Temperature:
     """Smooths readings in steps of READING_STEP_C; its error grows while readings are missing."""
 
@@ -91,6 +86,11 @@ class SensorTilts:
         self._axes = 0
         self._codes: tuple[float, ...] = ()
         self._equal: list[int] = []
+
+    def configure(self, values: Mapping[str, Any]) -> None:
+        """Apply the parameters that may change at run time."""
+        floor_deg = values["noise_stddev"]
+        self.noise_floor_rad = 0.0 if math.isnan(floor_deg) else math.radians(floor_deg)
 
     def reading(
         self,
@@ -161,8 +161,6 @@ class SensorTilts:
         self, angles: Sequence[float], turned: tuple[float, float]
     ) -> tuple[float, float, float, float]:
         """Derivatives of S's x and y by the sensor's own, as `cross_axis` has them."""
-        if self.cross_axis == SQUARE_AXES:
-            return SQUARE_AXES
         xx, xy, yx, yy = self.cross_axis
         # An angle of 90 deg has no slope.
         cx, cy, x, y = (max(math.cos(angle), 0.1) for angle in (*angles[:2], *turned))
@@ -202,8 +200,8 @@ class BoardSensor(SensorTilts):
         self.configure(values)
 
     def configure(self, values: Mapping[str, Any]) -> None:
+        super().configure(values)
         self.cross_axis = tuple(values["cross_axis"])
-        self.noise_floor_rad = noise_floor_rad(values)
 
     def measure(self, sample: Sample, time_s: float, stamp_ns: int = 0) -> Reading:
         """Convert a sample taken at `time_s` of a clock that does not step."""

@@ -34,7 +34,8 @@ class Pace:
         self._answers = self._fixes = 0
         # the rate, the stamp of the last frame, and when the next one is due that is wanted
         self._most_hz = self._before_s = self._due_s = math.nan
-        self._number: int | None = None
+        # the topic of the last frame, and its number there
+        self._number: tuple[object, int | None] = (None, None)
         # when each frame came, and whether it was taken
         self._lately: deque[tuple[float, bool]] = deque(maxlen=MAX_KEPT)
 
@@ -53,13 +54,13 @@ class Pace:
         self._due_s = max(self._due_s, unix_s - period_s) + period_s
         return True
 
-    def numbered(self, number: int | None, now_s: float) -> None:
+    def numbered(self, number: int | None, now_s: float, topic: object = None) -> None:
         """Drop the frames that the middleware lost before this one, by its number among its publisher's messages.
 
-        None: the middleware reports none.  A lower number is another publisher's.
+        None: the middleware reports none.  A lower number is another publisher's, as is one on another topic.
         """
-        last, self._number = self._number, number
-        if last is not None and number is not None and number > last + 1:
+        (before, last), self._number = self._number, (topic, number)
+        if topic == before and last is not None and number is not None and number > last + 1:
             self.drop(now_s, number - last - 1)
 
     def answered(self, fix: bool) -> None:

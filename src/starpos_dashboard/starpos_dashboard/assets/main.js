@@ -3,7 +3,6 @@
 
 import { Bubble } from "/bubble.js";
 import { Compass } from "/compass.js";
-import { Link } from "/link.js";
 import { showBudget, showLights } from "/lists.js";
 import { EarthMap } from "/map.js";
 import { dress, element, say } from "/page.js";
@@ -11,32 +10,54 @@ import { offerPlace } from "/place.js";
 import * as text from "/text.js";
 
 const TICK_MS = 500;
+const SILENT_MS = 5000; // the node speaks every second
+const AGAIN_MS = 3000;
 const AHEAD_S = 1; // a stamp further in the future is told
 const MAX_TRACK = 10000;
 const OWN_SOLUTION = /^[^/]+: Solution$/; // another instrument's name has its namespace
 
 let state = { lights: [], old_after: { slow: 15, fast: 5 } };
-let received = performance.now();
+let received = -Infinity; // when the state came
 let track = [];
 let full = 0;
 let map = null;
 const compass = new Compass(element("compass"));
 const bubble = new Bubble(element("bubble"));
 
-const link = new Link({
-  hear(told) {
-    [state, received, full] = [told, performance.now(), 0];
+// the line to the node ------------------------------------------------------------------------------------------------
+
+let line = null;
+let again = 0;
+
+const alive = () => performance.now() - received < SILENT_MS;
+
+function listen() {
+  hangUp();
+  line = new EventSource("/events");
+  line.addEventListener("state", (event) => {
+    [state, received, full] = [JSON.parse(event.data), performance.now(), 0];
     showFrame();
     render();
-  },
-  hearTrack({ begin, points }) {
+  });
+  line.addEventListener("track", (event) => {
+    const { begin, points } = JSON.parse(event.data);
     track = (begin ? points : track.concat(points)).slice(-MAX_TRACK);
-  },
-  hearFull(places) {
-    full = places;
+  });
+  line.addEventListener("full", (event) => {
+    full = Number(event.data);
     render();
-  },
-});
+  });
+  line.addEventListener("error", () => {
+    if (line.readyState !== EventSource.CLOSED) return; // the browser comes again by itself
+    clearTimeout(again);
+    again = setTimeout(listen, AGAIN_MS);
+  });
+}
+
+function hangUp() {
+  clearTimeout(again);
+  line?.close();
+}
 
 // ages --------------------------------------------------------------------------------------------------------------
 
@@ -46,7 +67,7 @@ const stampAge = (told) => (told.stamp === null ? heardAgo(told) : state.now + e
 
 // Of what comes with a frame: neither the message nor what it tells of may be old.
 const oldness = (told) => Math.max(heardAgo(told), stampAge(told));
-const isOld = (told) => oldness(told) > state.old_after.slow || !link.alive;
+const isOld = (told) => oldness(told) > state.old_after.slow || !alive();
 const fresh = (told) => (told && !isOld(told) ? told : null);
 
 function dressByAge(name, told, none) {
@@ -80,7 +101,7 @@ function verdict(fix) {
   const solver = state.lights.find((l) => OWN_SOLUTION.test(l.name) && heardAgo(l) < state.old_after.fast);
   const why = said || (solver && solver.level > 0 ? solver.sentence : "");
   if (full) return ["lost", "No place", `${full} pages are open already, as many as the parameter clients allows`];
-  if (!link.alive) return ["lost", "No connection", "the dashboard node is silent: what is shown is of the past"];
+  if (!alive()) return ["lost", "No connection", "the dashboard node is silent: what is shown is of the past"];
   if (!fix) return ["none", "No fix yet", why || "nothing has come on the topic fix"];
   if (isOld(fix) && heardAgo(fix) <= state.old_after.slow) {
     return ["old", "Old fix", `it was taken ${text.age(stampAge(fix))} ago: a replay, or a clock that is wrong`];
@@ -105,7 +126,7 @@ function showStatus(fix) {
   element("status").className = kind;
   say("status-word", word);
   say("status-sentence", sentence);
-  say("clock", link.alive ? `${text.utcTime(state.now).slice(0, 8)} UTC` : "");
+  say("clock", alive() ? `${text.utcTime(state.now).slice(0, 8)} UTC` : "");
 }
 
 function sigmas(fix) {
@@ -175,7 +196,7 @@ function showHeading() {
 
 function showTilt() {
   const { tilt } = state;
-  const old = Boolean(tilt) && (heardAgo(tilt) > state.old_after.fast || !link.alive);
+  const old = Boolean(tilt) && (heardAgo(tilt) > state.old_after.fast || !alive());
   const missing = !tilt || tilt.x === null || tilt.y === null;
   dress("tilt", old ? "old" : missing ? "missing" : "", old ? `${text.age(heardAgo(tilt))} old` : "");
   bubble.show(tilt);
@@ -223,8 +244,8 @@ function dressFrame() {
 
 // A page that nobody sees hears nothing, and the detector draws no frame for it.
 function look() {
-  if (document.hidden) link.close();
-  else link.open();
+  if (document.hidden) hangUp();
+  else listen();
 }
 
 // night ---------------------------------------------------------------------------------------------------------------
