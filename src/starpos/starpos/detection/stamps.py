@@ -2,7 +2,7 @@
 """The pixels around each star, all stars at once, and their Gaussian-windowed moments."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -33,14 +33,14 @@ class StarRows:
         """The rows that index selects; a mask (N,) that selects all copies nothing."""
         if isinstance(index, np.ndarray) and index.dtype == bool and index.all():
             return self
-        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        return replace(self, **{name: column[index] for name, column in vars(self).items()})
 
 
 def joined(parts: Sequence[Each]) -> Each:
     """The rows of several objects of one class, one after the other."""
     if len(parts) == 1:
         return parts[0]
-    rows = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(parts[0])}
+    rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
     return replace(parts[0], **rows)
 
 
