@@ -5,7 +5,6 @@ import errno
 import lzma
 import os
 import stat
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -110,7 +109,9 @@ def write_whole(path: Path | str, content: bytes) -> None:
     with suppress(FileNotFoundError):
         _check_regular(os.stat(target))
     target.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    from tempfile import mkstemp
+
+    descriptor, temporary = mkstemp(prefix=f".{target.name}.", dir=target.parent)
     try:
         with open(descriptor, "wb") as file:
             file.write(content)
