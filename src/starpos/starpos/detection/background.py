@@ -174,29 +174,11 @@ class SkyPlane:
     def of_pixels(
         self, x: np.ndarray, y: np.ndarray, rows: np.ndarray, columns: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Level and noise, DN, of the pixels rows, columns (N, ...) around the points x, y (N,), streaks included.
-
-        Level and noise of the sky are those `near` x, y.
-        """
-        shape = np.broadcast_shapes(rows.shape, columns.shape)
+        """Level and noise, DN, of the pixels rows, columns (N, ...): those `near` the points x, y (N,)."""
         level, noise = self.near(x, y)
-        if self.is_mosaic:
-            each = np.arange(len(x)).reshape(-1, *[1] * (len(shape) - 1))
-            phase = phase_of(rows, columns)
-            level, noise = level[each, phase], noise[each, phase]
-        else:
-            level, noise = (
-                np.broadcast_to(v.reshape(-1, *[1] * (len(shape) - 1)), shape) for v in (level, noise)
-            )
-        for streak in self.streaks:
-            more, least = streak.at(rows, columns)
-            level, noise = level + more, np.maximum(noise, least)
-        return level, noise
-
-
-def phase_of(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Number 0..3 (uint8) of a pixel within the 2 x 2 pattern of a colour mosaic."""
-    return (2 * (rows & 1)).astype(np.uint8) + (columns & 1).astype(np.uint8)
+        each = np.arange(len(x)).reshape(-1, *[1] * (rows.ndim - 1))
+        phase = (2 * (rows & 1) + (columns & 1)) % len(self.level)
+        return level[each, phase], noise[each, phase]
 
 
 def measure_sky(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None = None) -> SkyPlane:

@@ -48,19 +48,15 @@ class Streak:
 
     def at(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Level and noise (DN) of the streak at pixels; 0 off it."""
-        along, across = self._place(rows, columns)
+        dx, dy = columns - self.point[0], rows - self.point[1]
+        along_x, along_y = self.direction
+        along, across = dx * along_x + dy * along_y, dy * along_x - dx * along_y
         block = np.clip(along / self.length * len(self.level), 0, len(self.level) - 1).astype(int)
         offset = np.rint(across).astype(int) + HALF_WIDTH
         on = np.abs(along / self.length - 0.5) <= 0.5 + 2 * HALF_WIDTH / self.length
         on &= (offset >= 0) & (offset <= 2 * HALF_WIDTH)
         offset = np.where(on, offset, 0)
         return on * self.level[block, offset], on * self.noise[block, offset]
-
-    def _place(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distances of pixels along and across the streak, px."""
-        dx, dy = columns - self.point[0], rows - self.point[1]
-        along_x, along_y = self.direction
-        return dx * along_x + dy * along_y, dy * along_x - dx * along_y
 
 
 def find_streaks(sky: SkyPlane, x: np.ndarray, y: np.ndarray) -> tuple[Streak, ...]:
