@@ -5,6 +5,7 @@ import errno
 import lzma
 import os
 import stat
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -109,9 +110,7 @@ def write_whole(path: Path | str, content: bytes) -> None:
     with suppress(FileNotFoundError):
         _check_regular(os.stat(target))
     target.parent.mkdir(parents=True, exist_ok=True)
-    from tempfile import mkstemp
-
-    descriptor, temporary = mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    descriptor, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
     try:
         with open(descriptor, "wb") as file:
             file.write(content)

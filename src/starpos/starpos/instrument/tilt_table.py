@@ -99,8 +99,7 @@ ROUNDED_S, FEWEST_ROUNDED, FEWEST_STUCK = (128.0, 10_000.0), 3, 10
 def _check_digits(path: Path, t: np.ndarray) -> None:
     """TiltError if times (N,) were written with too few digits, so that many of them are the same."""
     t = t[np.isfinite(t)]
-    # np.unique would load numpy.ma, which takes as long as to solve a frame
-    different = len(set(t.tolist()))
+    different = len(np.unique(t))
     if len(t) < FEWEST_ROUNDED or different == len(t):
         return
     stuck = len(t) >= FEWEST_STUCK and different == 1

@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -200,8 +201,6 @@ class Night:
         if len(self.shots) > SHOWN:
             rows.append((f"{len(self.shots) - SHOWN} frames more", "", "", ""))
         head = ("frame", "status", "place (astronomic) and 1 sigma", "")
-        from html import escape
-
         table = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
         titles = "".join(f"<th>{title}</th>" for title in head)
         said = "".join(f"<p>{escape(remark)}</p>" for remark in self.remarks)
