@@ -233,11 +233,11 @@ def _beyond(mesh: np.ndarray, cells: int, slope: float = 1.0) -> np.ndarray:
 
 def between(mesh: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """The values (..., R, C) of meshes at rows (R,) and columns (C,), with fractions, as `SkyPlane.cell` gives them."""
-    # rows first: there are fewer of them
-    for axis, place in ((-2, rows[:, None]), (-1, columns)):
+    # quick where there are fewer rows than columns
+    for place in (rows, columns):
         low = place.astype(int)
-        share = (place - low).astype(mesh.dtype)
-        mesh = (1 - share) * mesh.take(low.ravel(), axis) + share * mesh.take(low.ravel() + 1, axis)
+        share = (place - low).astype(mesh.dtype)[:, None]
+        mesh = ((1 - share) * mesh.take(low, -2) + share * mesh.take(low + 1, -2)).swapaxes(-1, -2)
     return mesh
 
 

@@ -292,9 +292,7 @@ def learn(sky: SkyPlane, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Le
 
 def _strangeness(stamps: Stamps, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     """The residuals' squared light beyond the sky's noise over the model's, (N,), and its error (N,)."""
-    noise2, light2, left = (
-        np.where(fit.used, image, 0) ** 2 for image in (stamps.noise, fit.model, fit.residual)
-    )
+    noise2, light2, left = ((fit.used * image) ** 2 for image in (stamps.noise, fit.model, fit.residual))
     light2 = np.maximum(light2.sum((1, 2)), DARKEST)
     beyond = (left - noise2 * (1 - fit.leverage)).sum((1, 2))
     return beyond / light2, np.sqrt(2 * (noise2**2).sum((1, 2))) / light2
