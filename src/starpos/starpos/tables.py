@@ -2,7 +2,6 @@
 """CSV tables of numbers: the columns of each kind are declared once, and read into arrays by one set of rules."""
 
 import csv
-import difflib
 import io
 import math
 import os
@@ -123,7 +122,9 @@ class TableForm:
                 f"{place}: not a readable {self.what} (it has no column {lacking[0]}, or two): {self.cure}"
             )
         for name in set(names) - {*self.needed, *self.optional}:
-            for meant in difflib.get_close_matches(name, self.optional, 1, ALIKE_NAME):
+            from difflib import get_close_matches
+
+            for meant in get_close_matches(name, self.optional, 1, ALIKE_NAME):
                 raise self.error(
                     f"{place}: its column {name} is not read: call it {meant} if it holds that, else give it "
                     f"another name"

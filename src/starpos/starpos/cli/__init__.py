@@ -53,7 +53,7 @@ def _one_line_each(complain: Callable[[str], None]) -> Callable[..., None]:
 
 
 def parser_for(given: Sequence[str]) -> CommandParser:
-    """The parser of a call; only the options of the command in use are read, so that --help is quick."""
+    """The parser of a call: of the command in use alone, or of all commands' names, so that it is made quickly."""
     parser = CommandParser(
         prog="starpos",
         description="Position and heading from the stars.",
@@ -62,10 +62,12 @@ def parser_for(given: Sequence[str]) -> CommandParser:
     )
     parser.add_argument("--version", action="version", version=f"starpos {__version__}")
     choice = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, text in COMMANDS.items():
-        sub = choice.add_parser(name, help=text)
-        if given and given[0] == name:
-            import_module("starpos.cli.commands").command_of(name).define(sub)
+    if given and given[0] in COMMANDS:
+        sub = choice.add_parser(given[0], help=COMMANDS[given[0]])
+        import_module("starpos.cli.commands").command_of(given[0]).define(sub)
+    else:
+        for name, text in COMMANDS.items():
+            choice.add_parser(name, help=text)
     return parser
 
 

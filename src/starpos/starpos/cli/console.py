@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any
 
@@ -120,9 +119,12 @@ class ProgressBar:
         self.begin = time.monotonic()
 
     def __call__(self, what: str, done: float) -> None:
-        soon = time.monotonic() - self.begin < BAR_AFTER_S
+        if time.monotonic() - self.begin < BAR_AFTER_S or not sys.stderr.isatty():
+            return
+        from multiprocessing import parent_process
+
         # several processes would write over each other's
-        if soon or not sys.stderr.isatty() or parent_process() is not None:
+        if parent_process() is not None:
             return
         filled = int(30 * min(done, 1.0))
         end = "\n" if done >= 1 else ""

@@ -3,6 +3,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import product
 
 import cv2
 import numpy as np
@@ -108,8 +109,6 @@ def _is_white(side: np.ndarray, highest: int) -> bool:
     return bool(np.count_nonzero(side == highest) >= WHITE_SIDE * len(side))
 
 
-# One more cell beyond each edge of a mesh.
-BEYOND = (0, 0), (1, 1), (1, 1)
 # Maximum difference of neighbouring cells of continuous sky, in sigmas of a cell.
 STEEP = 5
 # DN rms. Rounding to whole numbers adds this noise, so no pixel has less.
@@ -175,29 +174,11 @@ class SkyPlane:
     def of_pixels(
         self, x: np.ndarray, y: np.ndarray, rows: np.ndarray, columns: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Level and noise, DN, of the pixels rows, columns (N, ...) around the points x, y (N,), streaks included.
-
-        Level and noise of the sky are those `near` x, y.
-        """
-        shape = np.broadcast_shapes(rows.shape, columns.shape)
+        """Level and noise, DN, of the pixels rows, columns (N, ...): those `near` the points x, y (N,)."""
         level, noise = self.near(x, y)
-        if self.is_mosaic:
-            each = np.arange(len(x)).reshape(-1, *[1] * (len(shape) - 1))
-            phase = phase_of(rows, columns)
-            level, noise = level[each, phase], noise[each, phase]
-        else:
-            level, noise = (
-                np.broadcast_to(v.reshape(-1, *[1] * (len(shape) - 1)), shape) for v in (level, noise)
-            )
-        for streak in self.streaks:
-            more, least = streak.at(rows, columns)
-            level, noise = level + more, np.maximum(noise, least)
-        return level, noise
-
-
-def phase_of(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Number 0..3 (uint8) of a pixel within the 2 x 2 pattern of a colour mosaic."""
-    return (2 * (rows & 1)).astype(np.uint8) + (columns & 1).astype(np.uint8)
+        each = np.arange(len(x)).reshape(-1, *[1] * (rows.ndim - 1))
+        phase = (2 * (rows & 1) + (columns & 1)) % len(self.level)
+        return level[each, phase], noise[each, phase]
 
 
 def measure_sky(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None = None) -> SkyPlane:
@@ -215,11 +196,10 @@ def measure_sky(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None = None
         level, noise = level.mean(0, keepdims=True), np.sqrt((noise**2).mean(0, keepdims=True))
     error = np.maximum(noise, QUANTISATION) * samples**-0.5
     # cells that differ by more lie at an edge, of a roof for example
-    steep = STEEP * np.array([median(e) for e in error.reshape(len(error), -1)])
-    even = _evened(np.concatenate([level, noise]), np.tile(steep, 2))
+    steep = STEEP * np.array(2 * [median(e) for e in error.reshape(len(error), -1)])
+    even = _evened(np.concatenate([level, noise]), steep)
     # a gradient of the level goes on beyond the edge
-    level = np.pad(even[: len(level)], BEYOND, "reflect", reflect_type="odd")
-    noise = np.pad(even[len(noise) :], BEYOND, "edge")
+    level, noise = _beyond(even[: len(level)], 1), _beyond(even[len(noise) :], 1, 0.0)
     noise = np.maximum(noise, max(QUANTISATION, _lost_noise(plane)))
     return SkyPlane(plane=plane, level=level, noise=noise)
 
@@ -231,19 +211,33 @@ def _evened(mesh: np.ndarray, steep: np.ndarray) -> np.ndarray:
     left out where it differs from the median by more than steep (P,), across an edge (of a roof).
     """
     base = mesh.mean((1, 2), keepdims=True)
-    around = np.pad(mesh - base, 2 * np.array(BEYOND), "reflect", reflect_type="odd").astype(np.float32)
+    around = _beyond(mesh - base, 2).astype(np.float32)
     typical = np.stack([cv2.medianBlur(one, 3) for one in around])
     mean = np.stack([cv2.blur(one, (3, 3)) for one in typical])
     even = np.where(np.abs(mean - typical) < steep[:, None, None], mean, typical)
     return even[:, 2:-2, 2:-2] + base
 
 
+def _beyond(mesh: np.ndarray, cells: int, slope: float = 1.0) -> np.ndarray:
+    """Meshes (P, rows, columns) with more cells beyond each edge, where so much of a gradient goes on.
+
+    A mesh is reflected about its first and last cells, as np.pad does, which takes longer to begin.
+    """
+    for cell, axis in product(range(cells), (1, 2)):
+        place = np.arange(-1, mesh.shape[axis] + 1)
+        nearest = np.minimum(np.maximum(place, cell), mesh.shape[axis] - 1 - cell)
+        edge = mesh.take(nearest, axis)
+        mesh = edge + slope * (edge - mesh.take(2 * nearest - place, axis, mode="clip"))
+    return mesh
+
+
 def between(mesh: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """The values (R, C) of a mesh at rows (R,) and columns (C,), with fractions, as `SkyPlane.cell` gives them."""
-    for place in (columns, rows):
+    """The values (..., R, C) of meshes at rows (R,) and columns (C,), with fractions, as `SkyPlane.cell` gives them."""
+    # quick where there are fewer rows than columns
+    for place in (rows, columns):
         low = place.astype(int)
         share = (place - low).astype(mesh.dtype)[:, None]
-        mesh = (1 - share) * mesh.T[low] + share * mesh.T[low + 1]
+        mesh = ((1 - share) * mesh.take(low, -2) + share * mesh.take(low + 1, -2)).swapaxes(-1, -2)
     return mesh
 
 

@@ -56,11 +56,12 @@ def find_disc(plane: np.ndarray) -> Disc | None:
     if min(plane.shape) < 16 * step:
         return None
     # what is narrower than three of these pixels, as stars and hot pixels are, leaves nothing
-    wide = cv2.erode(np.ascontiguousarray(plane[::step, ::step]), np.ones((3, 3), np.uint8))
+    wide = np.ascontiguousarray(plane[::step, ::step])
+    cv2.erode(wide, np.ones((3, 3), np.uint8), dst=wide)
     every = max(1, min(wide.shape) // SOME)
     some = wide[::every, ::every].astype(float)
     dark, top = float(np.sort(some, axis=None)[int(DARK * (some.size - 1))]), float(wide.max())
-    noise = median(np.abs(np.diff(some, axis=1)).ravel()) + 1.0
+    noise = median(np.abs(some[:, 1:] - some[:, :-1]).ravel()) + 1.0
     height = top - dark
     if height < max(CONTRAST * top, CLEAR * noise):
         return None

@@ -48,19 +48,15 @@ class Streak:
 
     def at(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Level and noise (DN) of the streak at pixels; 0 off it."""
-        along, across = self._place(rows, columns)
+        dx, dy = columns - self.point[0], rows - self.point[1]
+        along_x, along_y = self.direction
+        along, across = dx * along_x + dy * along_y, dy * along_x - dx * along_y
         block = np.clip(along / self.length * len(self.level), 0, len(self.level) - 1).astype(int)
         offset = np.rint(across).astype(int) + HALF_WIDTH
         on = np.abs(along / self.length - 0.5) <= 0.5 + 2 * HALF_WIDTH / self.length
         on &= (offset >= 0) & (offset <= 2 * HALF_WIDTH)
         offset = np.where(on, offset, 0)
         return on * self.level[block, offset], on * self.noise[block, offset]
-
-    def _place(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distances of pixels along and across the streak, px."""
-        dx, dy = columns - self.point[0], rows - self.point[1]
-        along_x, along_y = self.direction
-        return dx * along_x + dy * along_y, dy * along_x - dx * along_y
 
 
 def find_streaks(sky: SkyPlane, x: np.ndarray, y: np.ndarray) -> tuple[Streak, ...]:
@@ -245,7 +241,7 @@ def _crowded(peaks: Peaks) -> bool:
     leaders = min(len(peaks.x), LEADERS)
     alike = peaks.height > 0.5 * peaks.height[leaders - 1]
     pairs = spatial.cKDTree(peaks.points[alike]).query_pairs(CROWD, output_type="ndarray")
-    return len(np.unique(pairs[pairs < leaders])) > leaders / 2
+    return bool(np.count_nonzero(np.bincount(pairs[pairs < leaders])) > leaders / 2)
 
 
 def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
@@ -294,8 +290,8 @@ def _peaks_of(sky: SkyPlane, kernel: Kernel, threshold: float, limit: int, threa
     A colour mosaic leaves no trace in the smoothed frame: it is a pattern at the Nyquist frequency, where the kernel's
     response vanishes.
     """
-    level, noise = (v.astype(np.float32) for v in (sky.level.mean(0), np.sqrt((sky.noise**2).mean(0))))
-    correlation, unevenness = _noise_of_smooth(sky, kernel, level, noise)
+    level, noise = mesh = np.stack([sky.level.mean(0), np.sqrt((sky.noise**2).mean(0))]).astype(np.float32)
+    correlation, unevenness = _noise_of_smooth(sky, kernel, mesh)
     threshold = threshold * unevenness
     norm = kernel.norm * correlation
     # each strip against the lowest threshold of its mesh rows; the exact threshold follows below
@@ -345,9 +341,7 @@ def _in_parts(plane: np.ndarray, kernel: Kernel, limit: np.ndarray, threads: int
         )
 
 
-def _noise_of_smooth(
-    sky: SkyPlane, kernel: Kernel, level: np.ndarray, noise: np.ndarray
-) -> tuple[float, float]:
+def _noise_of_smooth(sky: SkyPlane, kernel: Kernel, mesh: np.ndarray) -> tuple[float, float]:
     """Two factors, 1 or more each, by which a smoothed frame is noisier than with independent pixels.
 
     The first is the correlation of neighbouring pixels, from demosaicing, resampling or lossy compression: it lowers the
@@ -357,8 +351,8 @@ def _noise_of_smooth(
     tops = np.linspace(0, max(0, len(plane) - 16), 8).astype(int)
     rows = (tops[:, None] + np.arange(0, min(16, len(plane)), 4)).ravel()
     value = smooth_rows(plane, kernel.weight, rows, 4)
-    place = sky.cell(np.arange(0, plane.shape[1], 4), rows)
-    score = (value - between(level, *place)) / between(noise, *place)
+    level, noise = between(mesh, *sky.cell(np.arange(0, plane.shape[1], 4), rows))
+    score = (value - level) / noise
     # stars widen the scatter upwards; where they are many, only the lowest values are free of them
     low, sigma_below, usual = _low_side(score.ravel())
     scatter = min(usual - sigma_below, sigma_below - low) / kernel.norm

@@ -235,7 +235,8 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
         sky = replace(sky, streaks=streaks)
     lesson = learn(sky, x, y, height)
     pixels = (2 * lesson.reach + 1) ** 2
-    chunk = max(1, int(np.clip(plane.size // 32, *CHUNK_PIXELS)) // pixels)
+    fewest, most = CHUNK_PIXELS
+    chunk = max(1, min(max(plane.size // 32, fewest), most) // pixels)
     most = min(len(x), limit * (PIXELS_PER_PEAK >> MAX_HALVINGS - picture.halvings) // pixels)
     found = measure(sky, x[:most], y[:most], lesson, settings.min_snr, chunk)
     found = resolve(found, lesson.psf)

@@ -30,11 +30,6 @@ class LocalPsf:
     axes: np.ndarray
     series: np.ndarray
 
-    @property
-    def shape(self) -> np.ndarray:
-        """Covariances (N, 2, 2) px2 of the Gaussians that the series multiply."""
-        return shapes_of(self.axes)
-
     def evaluate(self, left: np.ndarray, top: np.ndarray, size: int) -> np.ndarray:
         """The PSF at the pixels of N stamps (N, size, size).
 
@@ -58,12 +53,6 @@ class Psf:
     widths: np.ndarray
     series: np.ndarray
     box: np.ndarray
-
-    @property
-    def shape(self) -> np.ndarray:
-        """Covariance (2, 2) px2 of the mean star."""
-        inverse = np.linalg.inv(self.axes)
-        return inverse @ inverse.T
 
     @property
     def fwhm_px(self) -> float:

@@ -91,8 +91,11 @@ def _light_of(sky: SkyPlane, x: np.ndarray, y: np.ndarray, flux: np.ndarray, sig
     step = 2 if sky.is_mosaic else 1
     for phase in range(len(sky.level)):
         part = np.s_[phase // 2 :: step, phase % 2 :: step]
-        cell = sky.cell(np.arange(width)[part[1]], np.arange(height)[part[0]])
-        level, noise = (between(mesh[phase].astype(np.float32), *cell) for mesh in (sky.level, sky.noise))
+        row, column = sky.cell(np.arange(width)[part[1]], np.arange(height)[part[0]])
+        # the other way about, so that what lies in a row lies together
+        level, noise = (
+            between(mesh[phase].T.astype(np.float32), column, row).T for mesh in (sky.level, sky.noise)
+        )
         light[part] = (light[part] - level) / noise
     # columns and rows of the sensor that differ a little are no trails
     for axis, some in ((0, light[::4]), (1, light[:, ::4])):

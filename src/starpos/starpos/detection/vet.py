@@ -166,11 +166,13 @@ def _any_within(
     """
     if not pixels.any():
         return np.zeros(len(pixels), bool)
-    star, row, column = pixels.nonzero()
-    apart = np.stack([left[star] + column, top[star] + row], 1)
-    axes = np.broadcast_to(axes, (len(pixels), 2, 2))[star]
+    # much faster than nonzero() of three axes
+    star, row, column = np.unravel_index(np.flatnonzero(pixels), pixels.shape)
+    way = np.stack([left[star] + column, top[star] + row], 1)[..., None]
+    # one PSF serves all stars
+    near = np.hypot(*(axes[star % len(axes)] @ way).T[0]) < widths
     found = np.zeros(len(pixels), bool)
-    found[star[np.linalg.norm(np.einsum("nij,nj->ni", axes, apart), axis=1) < widths]] = True
+    found[star[near]] = True
     return found
 
 

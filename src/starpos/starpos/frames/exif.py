@@ -10,7 +10,6 @@ a person has said how good the clock is (CameraClock).
 """
 
 import io
-import logging
 import math
 import re
 from collections.abc import Mapping
@@ -86,6 +85,8 @@ class Exif:
     @classmethod
     def of(cls, data: bytes, width: int, height: int) -> "Exif":
         """Read the EXIF of a TIFF, JPEG, PNG or TIFF-like raw file (DNG, CR2, NEF ...); ImportError without exifread."""
+        import logging
+
         import exifread
 
         # it warns about every file without EXIF

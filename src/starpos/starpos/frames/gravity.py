@@ -16,7 +16,7 @@ from functools import cache
 import numpy as np
 
 from starpos.errors import FrameError
-from starpos.frames.tiff import exif_block, tiff_directory
+from starpos.frames.tiff import ORDERS, exif_block, tiff_directory
 from starpos.tables import packaged
 
 # names of inclinometers (instrument/sensors.py)
@@ -209,7 +209,6 @@ NOTES: tuple[tuple[bytes, int | None, int, bool, Callable[[_Note], Gravity | Non
     (b"Nikon\0\2", 10, 18, True, _nikon),
     (b"Panasonic\0", None, 12, False, _panasonic),
 )
-ORDERS = {b"II": "<", b"MM": ">"}
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from starpos.errors import FrameError, one_line
 from starpos.frames import exif
 from starpos.frames.frame import PATTERNS, Frame, check_pixels, to_unsigned
-from starpos.frames.tiff import JPEG_START, PNG_START, TIFF_ORDERS, tiff_directory
+from starpos.frames.tiff import JPEG_START, ORDERS, PNG_START, TIFF_ORDERS, tiff_directory
 
 BMP_START = b"BM"
 # Segments of a JPEG that hold its size, and the one where its image begins.
@@ -304,7 +304,7 @@ def _words(error: Exception) -> str:
 
 def _end(data: bytes) -> int:
     """Offset of the end of the last strip or tile in a file built like TIFF (CR2, DNG, NEF ...); 0 for other files."""
-    order = {b"II": "<", b"MM": ">"}.get(data[:2])
+    order = ORDERS.get(data[:2])
     if order is None or len(data) < 8:
         return 0
     seen: set[int] = set()

@@ -5,8 +5,9 @@ import struct
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 JPEG_START = b"\xff\xd8\xff"
-# Byte orders of a TIFF by its beginning.
+# Byte orders of a TIFF by its beginning, and of what is built like it.
 TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
+ORDERS = {b"II": "<", b"MM": ">"}
 # Letters of struct by type of a tag: BYTE, ASCII, SHORT, SBYTE, UNDEFINED, SSHORT, SLONG, DOUBLE, and the two numbers of
 # RATIONAL and SRATIONAL; of all others, LONG.
 TIFF_KINDS = {1: "B", 2: "B", 3: "H", 5: "II", 6: "b", 7: "B", 8: "h", 9: "i", 10: "ii", 12: "d"}
@@ -37,7 +38,7 @@ def tiff_directory(
 
 def exif_block(data: bytes) -> bytes:
     """The TIFF that holds the EXIF of a JPEG, a PNG or a file built like TIFF; b"" without one."""
-    if data[:2] in (b"II", b"MM"):
+    if data[:2] in ORDERS:
         return data
     at = 2
     while data.startswith(JPEG_START) and data[at : at + 1] == b"\xff" and at + 4 <= len(data):

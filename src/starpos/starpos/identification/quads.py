@@ -146,7 +146,7 @@ def build(catalogue: Catalogue, progress: Progress = quiet) -> QuadCatalogue:
         parts.append(_quads(cKDTree(v), v, pool, radius, most))
         progress("star quads", (k + 1) / (len(LEVELS) + 1))
     corners, shape, log_size = (np.concatenate(column) for column in zip(*parts, strict=True))
-    key = _key(_bin(shape[:, :4])) + _size_bin(log_size)
+    key = _bins(shape, log_size)
     order = np.argsort(key, kind="stable")
     starts = np.concatenate([[0], np.cumsum(np.bincount(key, minlength=BINS**4 * SIZE_BINS))])
     progress("star quads", 1.0)
@@ -190,19 +190,13 @@ def _distinct(rows: np.ndarray) -> np.ndarray:
     return rows[order[np.concatenate([[True], key[1:] != key[:-1]])]]
 
 
-def _bin(shape: np.ndarray) -> np.ndarray:
-    return np.clip((shape * BINS).astype(np.int32), 0, BINS - 1)
-
-
-def _size_bin(log_size: np.ndarray) -> np.ndarray:
+def _bins(shape: np.ndarray, log_size: np.ndarray) -> np.ndarray:
+    """Numbers (Q,) of the bins of shapes (Q, 5) and of the logarithms of sizes (Q,), which follow each other."""
     low, high = SIZES_RAD
-    return np.clip(((log_size - low) * (SIZE_BINS / (high - low))).astype(np.int32), 0, SIZE_BINS - 1)
-
-
-def _key(bins: np.ndarray) -> np.ndarray:
-    """Number of the first bin of a shape, whose sizes follow."""
-    a, b, c, d = bins.T
-    return (((a * BINS + b) * BINS + c) * BINS + d) * SIZE_BINS
+    sides = (shape[:, :4] * BINS).astype(np.int32)
+    size = ((log_size - low) * (SIZE_BINS / (high - low))).astype(np.int32)
+    bins = np.ravel_multi_index((*sides.T, size), (BINS, BINS, BINS, BINS, SIZE_BINS), mode="clip")
+    return bins.astype(np.int32)
 
 
 # The number of the folder's name is the format version.

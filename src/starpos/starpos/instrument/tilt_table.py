@@ -99,12 +99,13 @@ ROUNDED_S, FEWEST_ROUNDED, FEWEST_STUCK = (128.0, 10_000.0), 3, 10
 def _check_digits(path: Path, t: np.ndarray) -> None:
     """TiltError if times (N,) were written with too few digits, so that many of them are the same."""
     t = t[np.isfinite(t)]
-    if len(t) < FEWEST_ROUNDED or len(np.unique(t)) == len(t):
+    different = len(np.unique(t))
+    if len(t) < FEWEST_ROUNDED or different == len(t):
         return
-    stuck = len(t) >= FEWEST_STUCK and len(np.unique(t)) == 1
+    stuck = len(t) >= FEWEST_STUCK and different == 1
     if stuck or any((t % step == 0).all() for step in ROUNDED_S):
         raise TiltError(
-            f"{path}: {len(t)} readings have only {len(np.unique(t))} different times: they were rounded, as by float32 "
+            f"{path}: {len(t)} readings have only {different} different times: they were rounded, as by float32 "
             "or %g: write utc_unix_s with its fractions of a second (%.3f, double precision)"
         )
 

@@ -13,7 +13,6 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from math import degrees, hypot
 from pathlib import Path
 
@@ -154,6 +153,9 @@ def _about(exposures: Exposures, unreadable: int) -> dict:
 
 
 def _versions() -> Iterator[tuple[str, str]]:
+    # it takes long to load, and `starpos solve` has no use for it
+    from importlib.metadata import PackageNotFoundError, version
+
     for package in PACKAGES:
         try:
             yield package, version(package)

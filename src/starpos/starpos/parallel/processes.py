@@ -15,16 +15,18 @@ import traceback
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
-from multiprocessing import get_context, resource_tracker
-from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starpos.errors import FrameError, StarposError, one_line
 from starpos.parallel import BLAS_THREADS
+
+# work in this process must not wait for these to load
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+    from multiprocessing.connection import Connection
 
 # Calls for each process whose answers may wait for an earlier one.
 AHEAD = 4
@@ -117,6 +119,8 @@ class Processes:
         self._starting = Lock()
 
     def __enter__(self) -> "Processes":
+        from concurrent.futures import ThreadPoolExecutor
+
         for _ in range(self._number):
             self._start()
         self._threads = ThreadPoolExecutor(self._number)
@@ -140,6 +144,8 @@ class Processes:
 
     def map(self, calls: Iterable[Call]) -> Iterator:
         """Yield the answers as `in_turn` does."""
+        from concurrent.futures import wait
+
         coming = iter(calls)
         under_way: deque[tuple[Call, Future[_Said | str]]] = deque()
         while True:
@@ -208,6 +214,8 @@ class _Worker:
     """
 
     def __init__(self) -> None:
+        from multiprocessing import get_context
+
         self.pipe, theirs = get_context("spawn").Pipe()
         self.begun = self.ready = False
         self._process = get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True)
@@ -258,6 +266,8 @@ def _for_one_that_starts() -> Iterator[None]:
     os.environ.update({name: one for name, one in ONE_THREAD.items() if name not in before})
     masks = hasattr(signal, "pthread_sigmask")
     if masks:
+        from multiprocessing import resource_tracker
+
         # otherwise it starts with the first process, and unblocks SIGINT for it
         resource_tracker.ensure_running()
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -270,7 +280,7 @@ def _for_one_that_starts() -> Iterator[None]:
             del os.environ[name]
 
 
-def _serve(pipe: Connection) -> None:
+def _serve(pipe: "Connection") -> None:
     """Do the calls that come through the pipe until its other end is closed."""
     word = pickle.dumps(((), None))
     with suppress(EOFError, OSError):

@@ -8,7 +8,7 @@ from scipy import ndimage
 from starpos.detection._peaks import find_maxima, smooth_rows
 from starpos.detection._pixels import any_flat, third_highest
 from starpos.detection._sky import median, sky_at
-from starpos.detection.background import _evened, between
+from starpos.detection.background import _beyond, _evened, between
 from starpos.detection.finding import SHARP, WIDE
 
 
@@ -22,11 +22,23 @@ def test_a_mesh_is_evened_as_by_filters(size, rng):
         np.testing.assert_allclose(found, plain, rtol=0, atol=1e-5)
 
 
-def test_a_mesh_is_linear_between_its_cells(rng):
-    mesh = rng.normal(0, 1, (5, 8))
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 3), (5, 8)])
+def test_a_mesh_goes_on_beyond_its_edges_as_numpy_pads_it(size, rng):
+    mesh = rng.normal(0, 1, (2, *size))
+    for cells in (1, 2):
+        sides = (0, 0), (cells, cells), (cells, cells)
+        plain = np.pad(mesh, sides, "reflect", reflect_type="odd")
+        np.testing.assert_allclose(_beyond(mesh, cells), plain, rtol=0, atol=1e-13)
+        np.testing.assert_array_equal(_beyond(mesh, cells, 0.0), np.pad(mesh, sides, "edge"))
+
+
+def test_meshes_are_linear_between_their_cells(rng):
+    mesh = rng.normal(0, 1, (2, 5, 8))
     rows, columns = rng.uniform(0, 3.99, 9), rng.uniform(0, 6.99, 11)
-    plain = ndimage.map_coordinates(mesh, np.meshgrid(rows, columns, indexing="ij"), order=1)
-    np.testing.assert_allclose(between(mesh, rows, columns), plain, rtol=1e-12, atol=1e-12)
+    places = np.meshgrid(rows, columns, indexing="ij")
+    for found, one in zip(between(mesh, rows, columns), mesh, strict=True):
+        plain = ndimage.map_coordinates(one, places, order=1)
+        np.testing.assert_allclose(found, plain, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
