@@ -17,7 +17,7 @@ from starpos.earth.orientation import ROTATION_RAD_S, EarthOrientation, station_
 from starpos.earth.place import Place
 from starpos.errors import FixError, InstrumentError
 from starpos.fix._adjustment import gain_of, spread
-from starpos.fix.attitude import CAMERA, ENU, Attitude
+from starpos.fix.attitude import CAMERA, ITRS, Attitude
 from starpos.fix.sighting import Sighting
 from starpos.fix.solver import ENOUGH_SOUND, Solver
 from starpos.fix.star_fit import (
@@ -46,8 +46,8 @@ STRONGER = 0.01
 class ZenithSighting(Sighting):
     """A sighting at a known site, with the effects of its stars' errors.
 
-    camera: into geodetic east, north, up at the mark, with its errors by the stars' places on the frame alone.  All
-    rotations below are small ones of the camera about C's axes, rad.
+    camera: with its errors by the stars' places on the frame alone.  axes (3, 3): geodetic east, north, up at the mark,
+    in ITRS.  All rotations below are small ones of the camera about C's axes, rad.
     stars (N,): rows of the catalogue.  by_star (3, N, 3): rotation for 1 sigma of each star's place along ICRS's axes.
     star_weight (N, 3, 3), star_common (4, N, 3), star_pull (N, 3): normal equations of these displacements by this
     frame's stars alone: each star's own weight, less what attitude and scale take up, and the right side.
@@ -56,6 +56,7 @@ class ZenithSighting(Sighting):
     """
 
     tilt: Tilt
+    axes: np.ndarray
     stars: np.ndarray
     by_star: np.ndarray
     star_weight: np.ndarray
@@ -69,12 +70,12 @@ class ZenithSighting(Sighting):
     @property
     def enu_to_camera(self) -> np.ndarray:
         """Rotation (3, 3) of geodetic east, north, up into C."""
-        return self.camera.rotation.T
+        return self.camera.rotation.T @ self.axes.T
 
     def turned(self, turn: np.ndarray) -> "ZenithSighting":
         """Turn the camera by a rotation (3, 3) of its axes C."""
         camera, own = self.camera.rotation @ turn.T, self.camera.covariance_about_own
-        return replace(self, camera=Attitude.by_own(camera, own, of=CAMERA, into=ENU))
+        return replace(self, camera=Attitude.by_own(camera, own, of=CAMERA, into=ITRS))
 
     @property
     def heading(self) -> float:
@@ -142,7 +143,8 @@ def sighting(
     return ZenithSighting(
         source=stars.source,
         utc_unix_s=state.utc_unix_s,
-        camera=Attitude.by_own(fit.a4.T, spread(gain, centroids), of=CAMERA, into=ENU),
+        camera=Attitude.by_own(mark.axes.T @ fit.a4.T, spread(gain, centroids), of=CAMERA, into=ITRS),
+        axes=mark.axes,
         stars=index[kept],
         by_star=np.einsum("ing,ngj->inj", gain, displaced_px),
         star_weight=np.einsum("ngi,ngj->nij", shown, shown),

@@ -10,7 +10,7 @@ from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.orientation import EarthOrientation
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
-from starpos.fix.attitude import CAMERA, ENU, Attitude
+from starpos.fix.attitude import CAMERA, ITRS, Attitude
 from starpos.instrument.inclinometer import EXACT, Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.units import ARCSEC
@@ -98,7 +98,10 @@ def _sighting(number, utc_unix_s, attitude, theta):
     return ZenithSighting(
         source=f"{number}.csv",
         utc_unix_s=utc_unix_s,
-        camera=Attitude.by_own(attitude.T, np.diag([0.01, 0.01, 1.0]) ** 2 * ARCSEC**2, of=CAMERA, into=ENU),
+        camera=Attitude.by_own(
+            MARK.axes.T @ attitude.T, np.diag([0.01, 0.01, 1.0]) ** 2 * ARCSEC**2, of=CAMERA, into=ITRS
+        ),
+        axes=MARK.axes,
         stars=np.array([7]),
         by_star=np.zeros((3, 1, 3)),
         star_weight=np.zeros((1, 3, 3)),
