@@ -4,6 +4,7 @@
 import numpy as np
 
 from starpos import rotation
+from starpos.averaging.poses import slip_s
 from starpos.earth.geoid import Deflection
 from starpos.earth.place import Place
 from starpos.fix.attitude import CAMERA, ITRS, Attitude
@@ -36,3 +37,17 @@ def test_the_attitude_by_beacons_errs_as_it_claims(rng):
         nees.append(off @ np.linalg.solve(found.covariance, off))
     # three degrees of freedom; the fit allows for some scatter that is not there
     assert 1.7 < np.mean(nees) < 3.9
+
+
+def test_beacons_show_whether_the_camera_was_touched(rng):
+    level = camera_to_enu(100.0, 5.0, 2.0)
+    nudged = level @ rotation.from_vector([0.0, 0.002, 0.0])
+    xy = rng.uniform([50, 50], [950, 650], (60, 2))
+    first, still, touched = (
+        beacons_seen(
+            xy + rng.normal(0, SIGMA_PX, xy.shape), CAMERA_PX.directions(*xy.T) @ truth.T, 1.79e9
+        ).camera
+        for truth in (level, level, nudged)
+    )
+    assert slip_s(still, first, PLACE.latitude) == 0.0
+    assert slip_s(touched, first, PLACE.latitude) is None
