@@ -14,7 +14,7 @@ from starpos.earth.orientation import earth_state
 from starpos.frames.frame import FrameTrail
 from starpos.rotation import normalised
 from starpos.satellites.elements import read_orbits
-from starpos.satellites.orbits import Moments, seen, states
+from starpos.satellites.orbits import Moments, observed, states
 from starpos.session.replay import replay
 from starpos_common.messages import trails_to_message
 from starpos_interfaces.msg import Solution, TrailArray
@@ -46,7 +46,7 @@ class Dusk:
         """Directions (n, 3) among the catalogue places of the stars at a time."""
         moments = Moments.at(np.full(len(which), utc_unix_s))
         r, v = states(which, moments, np.zeros(len(which)))
-        return seen(r, v, moments.site(self.site, 0.0)[0], moments.velocity)[0]
+        return observed(r, v, moments.site(self.site, 0.0)[0], moments.velocity)[0]
 
     def shot(self):
         """A shot that looks at the highest satellite of the next moment, and its trails."""

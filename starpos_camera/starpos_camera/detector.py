@@ -33,7 +33,7 @@ from starpos_camera.after_solution import Annotator, TrailFinder
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, Troubles, time_is_simulated
 from starpos_common.messages import encoding_of, stars_to_message
 from starpos_common.parameters import declare
-from starpos_common.topics import LOOK_S, MatchedSubscription, Take, publisher, steady_timer, subscription
+from starpos_common.topics import LOOK_S, MatchedSubscription, Receiver, publisher, steady_timer, subscription
 from starpos_common.worker import Worker, failure_of_frame
 from starpos_interfaces.msg import Capture, StarArray
 from starpos_interfaces.srv import SetCapture
@@ -53,7 +53,7 @@ class FrameTopics:
     both: hear both topics all the time, as in a replay, where which of them sends shows only message by message.
     """
 
-    def __init__(self, node: Node, take: Take, both: bool) -> None:
+    def __init__(self, node: Node, take: Receiver, both: bool) -> None:
         self._node, self._take, self._both = node, take, both
         # with the raw topic the compressed one moves, unless it is remapped itself
         self.compressed_topic = node.resolve_topic_name(COMPRESSED)

@@ -95,12 +95,12 @@ class NavigatorNode(Node):
         self._session = NavigatorSession(self._settings, JobRunner(self), self._driver)
         self._outputs = NavigatorPublishers(self, self._settings)
         session, best_effort = self._session, ReliabilityPolicy.BEST_EFFORT
-        subscription(self, Imu, "imu/data", self._taker(session.receive_imu), IMU_QUEUE, best_effort)
-        subscription(self, msg.Attitude, "attitude", self._taker(session.receive_attitude), 100)
+        subscription(self, Imu, "imu/data", self._receiver(session.receive_imu), IMU_QUEUE, best_effort)
+        subscription(self, msg.Attitude, "attitude", self._receiver(session.receive_attitude), 100)
         for kind, name in ((Odometry, "odom"), (TwistWithCovarianceStamped, "twist")):
-            take = self._taker(partial(session.receive_velocity, name=name))
-            subscription(self, kind, name, take, 1000, best_effort)
-        subscription(self, NavSatFix, "gnss/fix", self._taker(session.receive_gnss), 10, best_effort)
+            receive = self._receiver(partial(session.receive_velocity, name=name))
+            subscription(self, kind, name, receive, 1000, best_effort)
+        subscription(self, NavSatFix, "gnss/fix", self._receiver(session.receive_gnss), 10, best_effort)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._diagnostics = Diagnostics(
             self,
@@ -113,14 +113,14 @@ class NavigatorNode(Node):
         self._outputs.parameters_set()
         self._session.parameters_set()
 
-    def _taker(self, receive: Callable[[Any, Now], list[Navigated]]) -> Callable[[Any], None]:
+    def _receiver(self, by_session: Callable[[Any, Now], list[Navigated]]) -> Callable[[Any], None]:
         """What takes the messages of a topic: the session receives them, and its outputs are published."""
 
-        def take(message: Any) -> None:
-            for output in receive(message, now_of(self)):
+        def receive(message: Any) -> None:
+            for output in by_session(message, now_of(self)):
                 self._outputs.publish(output)
 
-        return take
+        return receive
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._session.reset()

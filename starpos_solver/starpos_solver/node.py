@@ -21,7 +21,7 @@ from starpos.session.gyro import IMU_TOPIC
 from starpos.session.session import CAMERA_TOPIC, SolverSession
 from starpos.session.settings import Settings
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_simulated
-from starpos_common.topics import Dropped, Take, other_publishers, subscription, subscription_from_any
+from starpos_common.topics import Dropped, Receiver, other_publishers, subscription, subscription_from_any
 from starpos_common.worker import JobRunner
 from starpos_interfaces import msg
 from starpos_interfaces.srv import Solve
@@ -67,19 +67,19 @@ class SolverNode(Node):
         self._outputs = SolutionPublishers(self, self._settings)
         self._transforms = StaticTransforms(self)
         session = self._session
-        subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._taker(CAMERA_TOPIC), 10)
+        subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._receiver(CAMERA_TOPIC), 10)
         self._ears = {
-            name: subscription(self, kind, name, self._taker(name), QUEUES[name])
+            name: subscription(self, kind, name, self._receiver(name), QUEUES[name])
             for name, kind in (("tilt", msg.Tilt), ("stars", msg.StarArray))
         }
         if session.satellites is not None:
-            subscription(self, msg.TrailArray, "trails", self._taker("trails"), 10)
+            subscription(self, msg.TrailArray, "trails", self._receiver("trails"), 10)
         self._again = self.create_guard_condition(self._go_on)
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
         self._gnss = ComparedPlaces()
-        hear = self._compare_gnss if session.gnss is None else self._taker(GNSS_TOPIC)
+        hear = self._compare_gnss if session.gnss is None else self._receiver(GNSS_TOPIC)
         # receivers' drivers publish in either way
         subscription(self, NavSatFix, GNSS_TOPIC, hear, 10, ReliabilityPolicy.BEST_EFFORT)
         self.create_service(Solve, "~/solve", self._on_solve)
@@ -121,14 +121,14 @@ class SolverNode(Node):
 
     # inputs ----------------------------------------------------------------------------------------------------------
 
-    def _taker(self, name: str) -> Take:
+    def _receiver(self, name: str) -> Receiver:
         """What takes the messages of a topic: the session receives them, and its outputs are published."""
 
-        def take(message: Any, info: Mapping[str, Any]) -> None:
+        def receive(message: Any, info: Mapping[str, Any]) -> None:
             self._note_dropped(name, info)
             self._publish(self._session.receive(ALL_INPUTS[name], message, now_of(self), _sent(info)))
 
-        return take
+        return receive
 
     def _compare_gnss(self, message: NavSatFix) -> None:
         self._gnss.receive(message, now_of(self))

@@ -24,7 +24,7 @@ from starpos.satellites.adjustment import KnownBefore
 from starpos.satellites.elements import CLASSES, Orbit
 from starpos.satellites.locating import locate
 from starpos.satellites.naming import OrbitsAbove
-from starpos.satellites.orbits import Moments, along_axes, seen, states
+from starpos.satellites.orbits import Moments, along_axes, observed, states
 from starpos.satellites.trails import SatelliteTrail
 from starpos.units import ARCSEC, DAY_S, UNIX_EPOCH_JD
 
@@ -95,7 +95,7 @@ def directions_of(
     r, v = states(orbits, moments, along / np.linalg.norm(v, axis=1))
     axes = along_axes(r, v)
     site, _ = moments.site(place, 0.0)
-    return seen(r + radial * axes[:, 0] + across * axes[:, 2], v, site, moments.velocity)[0]
+    return observed(r + radial * axes[:, 0] + across * axes[:, 2], v, site, moments.velocity)[0]
 
 
 def cost(options: argparse.Namespace) -> int:

@@ -27,7 +27,7 @@ MAX_DEPTH = 100_000
 # no warning of rclpy's where a publisher does not match
 SILENT = SubscriptionEventCallbacks(use_default_callbacks=False)
 # A message, and the middleware's information on it.
-Take = Callable[[Any, Mapping[str, Any]], object]
+Receiver = Callable[[Any, Mapping[str, Any]], object]
 
 
 def publisher(node: Node, kind: type, topic: str, depth: int, latched: bool = False) -> Publisher:
@@ -63,7 +63,7 @@ def subscription(
         )
 
 
-def subscription_from_any(node: Node, kind: type, topic: str, callback: Take, depth: int) -> None:
+def subscription_from_any(node: Node, kind: type, topic: str, callback: Receiver, depth: int) -> None:
     """Subscribe to a topic of small messages however it is published; each message is taken once.
 
     DDS has no subscription for all: one that wants what was sent before it came hears no volatile publisher, and one

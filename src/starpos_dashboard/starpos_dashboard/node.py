@@ -94,7 +94,7 @@ class DashboardNode(Node):
         self.create_subscription(DiagnosticArray, "/diagnostics", self._board.hear_diagnostics, 50)
         # Subscribe once now, so that a wrong qos_override is refused at the start.
         self.destroy_subscription(self._subscribe_frames())
-        self._timer = steady_timer(self, 1 / self._values["rate"], self._tell)
+        self._timer = steady_timer(self, 1 / self._values["rate"], self._update_page)
         self._diagnostics = Diagnostics(self, {"Page": self._report})
 
     def _announce(self, address: str) -> None:
@@ -116,7 +116,7 @@ class DashboardNode(Node):
 
     # the page --------------------------------------------------------------------------------------------------------
 
-    def _tell(self) -> None:
+    def _update_page(self) -> None:
         now = time.monotonic()
         self._follow_viewers()
         if self._image is not None and now - self._shown_at >= 1 / self._values["image_rate"]:

@@ -127,18 +127,18 @@ class IndiDevice:
         for name, text in members.items():
             ET.SubElement(element, f"one{found.kind}", name=name).text = text
         found.state, found.asked = "Busy", True
-        self._tell(element)
+        self._send(element)
 
     def enable_blobs(self, vector: str) -> None:
         """Ask the server to send the BLOBs of a vector, besides everything else."""
         element = ET.Element("enableBLOB", device=self.name, name=vector)
         element.text = "Also"
-        self._tell(element)
+        self._send(element)
 
     def _ask(self, **what: str) -> None:
-        self._tell(ET.Element("getProperties", {"version": "1.7", **what}))
+        self._send(ET.Element("getProperties", {"version": "1.7", **what}))
 
-    def _tell(self, element: ET.Element) -> None:
+    def _send(self, element: ET.Element) -> None:
         try:
             self._socket.sendall(ET.tostring(element))
         except OSError:
@@ -163,7 +163,7 @@ class IndiDevice:
                 self._depth += 1 if event == "start" else -1
                 # An element has come whole.
                 if self._depth == 0:
-                    self._take(element)
+                    self._receive(element)
                     self._root.clear()
                     self._pending = 0
         except ET.ParseError as error:
@@ -171,7 +171,7 @@ class IndiDevice:
         if self._pending > ELEMENT_MAX:
             raise CaptureError("the INDI server sends more than any frame has.")
 
-    def _take(self, element: ET.Element) -> None:
+    def _receive(self, element: ET.Element) -> None:
         kind, name = element.tag, element.get("name", "")
         device = element.get("device", "")
         if kind.startswith("def"):

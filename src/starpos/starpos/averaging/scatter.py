@@ -191,7 +191,7 @@ def _pose_means(frames: Frames) -> np.ndarray:
 def _freedom(y: np.ndarray, j: np.ndarray, stated: np.ndarray, prior_sigma: np.ndarray) -> tuple[float, bool]:
     """Degrees of freedom of data (B, 2), and whether these show that they scatter more than (B, B) states."""
     normal, pull, _ = _sums(y, j, stated[None])
-    free = 2 * len(y) - _told(normal[0], prior_sigma)
+    free = 2 * len(y) - _determined(normal[0], prior_sigma)
     if free >= MIN_FREE:
         return free, True
     scaled, pulled = normal[0] * np.outer(prior_sigma, prior_sigma), pull[0] * prior_sigma
@@ -285,7 +285,7 @@ def _sums(y: np.ndarray, j: np.ndarray, covariance: np.ndarray) -> tuple[np.ndar
     )
 
 
-def _told(normal: np.ndarray, prior_sigma: np.ndarray) -> float:
+def _determined(normal: np.ndarray, prior_sigma: np.ndarray) -> float:
     """Number of parameters that the data determine rather than the prior."""
     told = np.maximum(np.linalg.eigvalsh(normal * np.outer(prior_sigma, prior_sigma)), 0.0)
     return float(np.sum(told / (1 + told)))

@@ -183,7 +183,7 @@ def calibrate(
             break
         a3 = solver.instrument.calibration.a3
         agreement = _agreed(find, solved, a3, errors)
-        now = replace(_found(agreement), covariance_arcsec2=given.covariance_arcsec2)
+        now = replace(_calibration_of(agreement), covariance_arcsec2=given.covariance_arcsec2)
         solver = _with(solver, now if inside else _unknown(agreement), agreement.errors)
         # a turn about the plumb line changes no fix
         if k and np.linalg.norm(agreement.plumb.a3[2] - a3[2]) < SETTLED_RAD:
@@ -398,7 +398,7 @@ def _unknown(agreement: _Agreement) -> Calibration:
 
     With an unknown turn every lean would become an error.
     """
-    plumb, found = agreement.plumb, _found(agreement)
+    plumb, found = agreement.plumb, _calibration_of(agreement)
     up = found.up
     turn_arcsec = np.sqrt(up @ plumb.covariance @ up) / ARCSEC
     across, about = UNKNOWN_ARCSEC[0], min(UNKNOWN_ARCSEC[2], TURN_SIGMA * turn_arcsec)
@@ -428,7 +428,7 @@ def _dated(agreement: _Agreement) -> Calibration:
     """The calibration at the mean time, temperature and tilt of the frames."""
     sound = agreement.sound
     return replace(
-        _found(agreement),
+        _calibration_of(agreement),
         covariance_arcsec2=tuple(map(tuple, (agreement.plumb.covariance / ARCSEC**2).tolist())),
         utc_unix_s=float(np.mean([f.utc_unix_s for f in sound])),
         frames=len(sound),
@@ -436,7 +436,7 @@ def _dated(agreement: _Agreement) -> Calibration:
     )
 
 
-def _found(agreement: _Agreement) -> Calibration:
+def _calibration_of(agreement: _Agreement) -> Calibration:
     """The A3 that was found, at the mean temperature and tilt of the frames, with the response if the poses show it."""
     plumb, axes = agreement.plumb, agreement.sound[0].tilt.axes
     found = Calibration(

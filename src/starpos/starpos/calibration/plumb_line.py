@@ -238,7 +238,7 @@ def fits(
     )
     p = np.zeros((len(starts), len(sigma)))
     p[:, 2] = turned
-    return problem.found(_State(starts, zenith, p))
+    return problem.answers(_State(starts, zenith, p))
 
 
 @at_once
@@ -259,7 +259,7 @@ class _Fits:
     across: np.ndarray
     seen_across: np.ndarray
 
-    def found(self, now: _State) -> list[PlumbLine]:
+    def answers(self, now: _State) -> list[PlumbLine]:
         """The answer from each start."""
         best, answer = np.full(len(now.p), np.inf), now
         for _ in range(MAX_STEPS):

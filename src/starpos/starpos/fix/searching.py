@@ -213,7 +213,7 @@ def _another(
     """
     if not first.solution.lost or is_over():
         return first
-    for seen, enough in _seen(item, first.stars):
+    for seen, enough in _detections(item, first.stars):
         for answer in ways(seen):
             if answer.pointing is not None and answer.pointing.log_odds >= enough:
                 return Sight(seen, answer)
@@ -222,7 +222,7 @@ def _another(
     return first
 
 
-def _seen(item: Frame | Stars, stars: Stars) -> Iterator[tuple[Stars, float]]:
+def _detections(item: Frame | Stars, stars: Stars) -> Iterator[tuple[Stars, float]]:
     """Yield the stars of a frame, then of its other detections, each with its minimum log-odds."""
     yield stars, -math.inf
     if isinstance(item, Stars):

@@ -62,7 +62,7 @@ from starpos.units import HOUR_S
 MIN_ALTITUDE_RAD = math.radians(10)
 
 # Sine of the altitude beyond which the stars of a frame determine the sign of up: A3 may be off by degrees.
-MIN_TOLD_SINE = math.sin(math.radians(6))
+MIN_UPRIGHT_SINE = math.sin(math.radians(6))
 
 
 def inside(stars: Stars, camera: Camera) -> np.ndarray | None:
@@ -287,7 +287,7 @@ class Solver:
         if isinstance(frame, Stars) and len(frame.x):
             seen = directions_of(self.view(frame.width, frame.height, frame.origin_px)[0], frame)
         sine = float(seen.mean(0) @ self.instrument.calibration.a3.T @ tilt.up)
-        if self.instrument.calibration.unknown or abs(sine) < MIN_TOLD_SINE:
+        if self.instrument.calibration.unknown or abs(sine) < MIN_UPRIGHT_SINE:
             raise TiltError(EITHER_WAY)
         return replace(tilt if sine > 0 else tilt.reversed, either_way=False)
 

@@ -237,9 +237,9 @@ def _from_mapping(content: dict, folder: Path, needs_camera: bool) -> Instrument
         optics = _camera(content.get("camera"), folder)
     given = {name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content}
     sensor, errors = _sensor(content, bool(given))
-    more = _told(content, INSTRUMENT)
+    more = _arguments(content, INSTRUMENT)
     if "shutter" in content:
-        more["shutter"] = Shutter(**_told(_mapping(content, "shutter", SHUTTER), SHUTTER, needed=True))
+        more["shutter"] = Shutter(**_arguments(_mapping(content, "shutter", SHUTTER), SHUTTER, needed=True))
     instrument = Instrument(
         **optics,
         calibration=_calibration(content),
@@ -259,11 +259,11 @@ def _from_mapping(content: dict, folder: Path, needs_camera: bool) -> Instrument
     sag = _number(about, SAG)
     if not 0 <= sag <= MAX_SAG_ARCSEC:
         raise InstrumentError(f"{SAG} is {sag:g}: give a number from 0 to {MAX_SAG_ARCSEC:g}")
-    vertical = CameraVertical(**_told(about, VERTICAL, needed=True))
+    vertical = CameraVertical(**_arguments(about, VERTICAL, needed=True))
     return replace(instrument, vertical=vertical, inclinometer=level_errors(sag))
 
 
-def _told(content: dict, schema: Schema, needed: bool = False) -> dict[str, Any]:
+def _arguments(content: dict, schema: Schema, needed: bool = False) -> dict[str, Any]:
     """The arguments of a part of an instrument that a mapping states; needed: all of them."""
     return {
         RENAMED.get(key, key): read(content, key) for key, read in schema.items() if needed or key in content
@@ -318,7 +318,7 @@ def _size(camera: dict) -> tuple[int, int]:
 def _calibration(content: dict) -> Calibration:
     if STDDEV in content and COVARIANCE in content:
         raise InstrumentError(f"{STDDEV} and {COVARIANCE} say the same thing: give one of them")
-    more = _told(content, CALIBRATION)
+    more = _arguments(content, CALIBRATION)
     if STDDEV in content:
         angles = more.get("misalignment_deg", (0.0, 0.0, 0.0))
         more["covariance_arcsec2"] = Calibration.of(angles, _row(content, STDDEV)).covariance_arcsec2
@@ -328,7 +328,7 @@ def _calibration(content: dict) -> Calibration:
             more["utc_unix_s"] = unix_of(str(about.get("utc")))
         except TimeError as e:
             raise InstrumentError(f"calibrated: {e}") from None
-        more |= _told(about, CALIBRATED)
+        more |= _arguments(about, CALIBRATED)
     return Calibration(**more)
 
 

@@ -47,7 +47,7 @@ def draw_map(
     coast = _joined(coast_lines())
     for axes, reach, step, size in zip((globe, lens), (90, LENS), STEPS, MARKERS, strict=True):
         _draw_disc(axes, np.sin(np.radians(reach)), size, *(
-            _seen_from(latitude, longitude, lines) for lines in (_graticule(step), coast)
+            _projected(latitude, longitude, lines) for lines in (_graticule(step), coast)
         ))  # fmt: skip
     if covariance is not None:
         around = np.linspace(0, 2 * np.pi, 73)
@@ -68,7 +68,7 @@ def _draw_disc(axes: "Axes", radius: float, size: float, graticule: np.ndarray, 
     axes.set_axis_off()
 
 
-def _seen_from(latitude: float, longitude: float, lines: np.ndarray) -> np.ndarray:
+def _projected(latitude: float, longitude: float, lines: np.ndarray) -> np.ndarray:
     """Orthographic projection (N, 2), in radii of the Earth, of longitudes and latitudes (N, 2) in deg; NaN behind it."""
     v = unit_vector(*np.radians(lines).T) @ enu_axes(latitude, longitude).T
     return np.where(v[:, 2:] >= 0, v[:, :2], np.nan)

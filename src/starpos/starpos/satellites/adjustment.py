@@ -18,7 +18,7 @@ from starpos.earth.gravity import enu_at, geodetic_place, itrs_place
 from starpos.earth.place import Place
 from starpos.frozen import at_once
 from starpos.satellites.elements import Orbit
-from starpos.satellites.orbits import Moments, along_axes, raised, seen, states
+from starpos.satellites.orbits import Moments, along_axes, observed, raised, states
 from starpos.satellites.trails import SatelliteTrail
 
 STEPS = 6
@@ -150,7 +150,7 @@ class Adjuster:
         site, moving = earth.site(place, clock_s)
         above = np.einsum("eji,j->ei", earth.gcrs_to_itrs, enu[2])
         lift = raised(place, np.einsum("eij,ej->ei", earth.gcrs_to_itrs, self.directions))
-        u, distance = seen(r, v, site + above * lift[:, None], earth.velocity)
+        u, distance = observed(r, v, site + above * lift[:, None], earth.velocity)
         across = self.axes / distance[:, None, None]
         residual = np.einsum("eki,ei->ek", self.axes, self.directions - u)
         by_place = -np.einsum("eki,eji,lj->ekl", across, earth.gcrs_to_itrs, enu)

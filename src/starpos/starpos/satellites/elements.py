@@ -144,19 +144,19 @@ class StoredOrbits:
     def __init__(self, path: Path | str) -> None:
         self._path, self.trouble = Path(path), ""
         self._orbits, _ = read_orbits(self._path)
-        self._files = self._seen()
+        self._files = self._file_states()
 
     def read(self) -> list[Orbit]:
         """The orbits as they are now; if they became unreadable, the earlier ones, and `trouble` says why."""
         try:
-            if (files := self._seen()) != self._files:
+            if (files := self._file_states()) != self._files:
                 self._orbits, said = read_orbits(self._path)
                 self._files, self.trouble = files, " ".join(said)
         except (OSError, SatelliteError) as error:
             self.trouble = str(error)
         return self._orbits
 
-    def _seen(self) -> list[tuple[str, int, int]]:
+    def _file_states(self) -> list[tuple[str, int, int]]:
         """Name, time of writing and size of each file."""
         files = sorted(self._path.iterdir()) if self._path.is_dir() else [self._path]
         return [(f.name, (state := f.stat()).st_mtime_ns, state.st_size) for f in files]

@@ -71,7 +71,9 @@ def states(orbits: Sequence[Orbit], moments: Moments, seconds: np.ndarray) -> tu
     return r, v
 
 
-def seen(r: np.ndarray, v: np.ndarray, site: np.ndarray, earth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def observed(
+    r: np.ndarray, v: np.ndarray, site: np.ndarray, earth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Directions (E, 3) among the stars' catalogue places, and distances (E,) m, of satellites.
 
     r, v (E, 3): their states, GCRS.  site (E, 3): the observers', m.  earth (E, 3): the Earth's barycentric velocity in

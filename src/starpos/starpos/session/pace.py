@@ -166,7 +166,7 @@ class Backlog(deque[Waiting]):
             self.popleft()
         return dropped
 
-    def take(self, now_s: float) -> Waiting:
+    def pop_first(self, now_s: float) -> Waiting:
         """Pop the first frame, which is answered from now on."""
         if not math.isnan(self._begun_s):
             self._costs_s.append(now_s - self._begun_s)

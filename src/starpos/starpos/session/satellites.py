@@ -96,10 +96,10 @@ class LiveSatellites:
         self._jobs.run(
             lambda: located(frames, trails, self._orbits, self._catalogue, prior, window_s),
             # a defect loses these frames' trails
-            lambda o: self._take(o.value or Located(stamp=frames[-1][0], trails=trails, why=o.trouble)),
+            lambda o: self._finish(o.value or Located(stamp=frames[-1][0], trails=trails, why=o.trouble)),
         )
 
-    def _take(self, found: Located) -> None:
+    def _finish(self, found: Located) -> None:
         self._newest = found
         self._made.append(found)
         if (fix := found.fix) is not None:

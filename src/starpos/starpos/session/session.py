@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 # what takes a message; it may return answers
-Take = Callable[[Any, Now, Sent], list[Output] | None]
+Receiver = Callable[[Any, Now, Sent], list[Output] | None]
 NOTHING_TOLD = Sent()
 J2000_UNIX_S = 946_728_000.0
 # A stamp further in the future than AHEAD_S and this many stated sigmas is wrong.
@@ -101,15 +101,15 @@ class SolverSession:
         self.gnss: GnssTeacher | None = None
         if settings.values["gnss.use"]:
             self.gnss = GnssTeacher(settings, jobs(), driver, self.satellites)
-        self._take: dict[str, Take] = {
-            CAMERA_INFO: self._take_camera,
-            TILT: self._take_tilt,
-            STARS: self._take_stars,
+        self._receivers: dict[str, Receiver] = {
+            CAMERA_INFO: self._receive_camera,
+            TILT: self._receive_tilt,
+            STARS: self._receive_stars,
         }
         if (gnss := self.gnss) is not None:
-            self._take[NAV_SAT_FIX] = lambda message, now, sent: gnss.receive(message, now)
+            self._receivers[NAV_SAT_FIX] = lambda message, now, sent: gnss.receive(message, now)
         if (by_trails := self.satellites) is not None:
-            self._take[TRAILS] = lambda message, now, sent: by_trails.receive(message)
+            self._receivers[TRAILS] = lambda message, now, sent: by_trails.receive(message)
         self.places = SessionPlaces(settings, self.gnss, self.satellites)
         self.deflection = LiveDeflection(settings, waited_for())
         self._search = Search(settings.values)
@@ -173,7 +173,7 @@ class SolverSession:
     @property
     def inputs(self) -> dict[str, str]:
         """The types of the messages that it takes by the relative names of their topics."""
-        return {name: kind for name, kind in ALL_INPUTS.items() if kind in self._take}
+        return {name: kind for name, kind in ALL_INPUTS.items() if kind in self._receivers}
 
     @property
     def waits(self) -> bool:
@@ -208,18 +208,18 @@ class SolverSession:
         were taken before it.
         """
         made = self._begun(now)
-        made += self._take[kind](message, now, sent) or []
+        made += self._receivers[kind](message, now, sent) or []
         return made + self._work(now)
 
-    def _take_camera(self, message: Any, now: Now, sent: Sent) -> None:
+    def _receive_camera(self, message: Any, now: Now, sent: Sent) -> None:
         with refusing(self._driver, "camera_info"):
             self.instrument.receive(message, at_once=not now.played)
 
-    def _take_tilt(self, message: Any, now: Now, sent: Sent) -> None:
+    def _receive_tilt(self, message: Any, now: Now, sent: Sent) -> None:
         with refusing(self._driver, "tilt"):
             self.tilts.receive(message, sent, now)
 
-    def _take_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
+    def _receive_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
         """Take a StarArray, and those that have come after it."""
         made = self._add_stars(message, now, sent)
         for later, later_sent in self._arrived("stars"):
@@ -228,7 +228,7 @@ class SolverSession:
 
     def _add_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
         """Have a frame wait for its tilts, if there is room; return a bad one's answer."""
-        if not self._takes(message.header, now, sent):
+        if not self._accepts(message.header, now, sent):
             return []
         try:
             stars = message_to_stars(message)
@@ -242,11 +242,11 @@ class SolverSession:
     def receive_detected(self, stars: Stars, header: Any, now: Now) -> list[Output]:
         """Take stars as a StarArray with this header holds them."""
         made = self._begun(now)
-        if self._takes(header, now, NOTHING_TOLD):
+        if self._accepts(header, now, NOTHING_TOLD):
             self._wait_for(stars, header, now)
         return made + self._work(now)
 
-    def _takes(self, header: Any, now: Now, sent: Sent) -> bool:
+    def _accepts(self, header: Any, now: Now, sent: Sent) -> bool:
         """Whether a frame is wanted and can be answered in time."""
         self._driver.came("stars")
         if not now.played:
@@ -327,8 +327,8 @@ class SolverSession:
                 return made
             # After a stall the frame's own tilts may be among them.
             for message, sent in self._arrived("tilt"):
-                self._take_tilt(message, now, sent)
-            made.append(self._solve(self._backlog.take(now.waiting_s).dated(now), now))
+                self._receive_tilt(message, now, sent)
+            made.append(self._solve(self._backlog.pop_first(now.waiting_s).dated(now), now))
         self._backlog.pause()
         return made
 

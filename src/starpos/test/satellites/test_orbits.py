@@ -11,7 +11,7 @@ from astropy.time import Time
 from starpos.earth.gravity import itrs_place
 from starpos.earth.orientation import earth_state
 from starpos.satellites.elements import Ephemeris, read_orbits, teme_to_gcrs
-from starpos.satellites.orbits import Moments, raised, seen, states
+from starpos.satellites.orbits import Moments, observed, raised, states
 
 PLACE = 40.0, 10.0, 1500.0
 
@@ -47,7 +47,7 @@ def direction(orbit, earth=None):
     moments = Moments.at(np.array([skies.NIGHT]))
     r, v = states([orbit], moments, np.zeros(1))
     site, _ = moments.site(itrs_place(*np.radians(PLACE[:2]), PLACE[2]), 0.0)
-    u, distance = seen(r, v, site, moments.velocity if earth is None else earth)
+    u, distance = observed(r, v, site, moments.velocity if earth is None else earth)
     return u[0], distance[0]
 
 

@@ -39,7 +39,7 @@ def live(tmp_path):
 def placed(live):
     """Have it know a place."""
     fix = SimpleNamespace(latitude=0.8, longitude=0.1, covariance=np.diag([900.0, 1600.0, 400.0]))
-    live._take(Located(stamp=STAMP, trails=(SimpleNamespace(utc_unix_s=np.array([NIGHT])),), fix=fix))
+    live._finish(Located(stamp=STAMP, trails=(SimpleNamespace(utc_unix_s=np.array([NIGHT])),), fix=fix))
     return fix
 
 
