@@ -7,6 +7,7 @@ import inspect
 import re
 import subprocess
 import sys
+from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -114,8 +115,11 @@ def test_the_example_of_a_public_name_is_what_comes_of_it(name, workplace, monke
     monkeypatch.chdir(workplace)
     thing = getattr(starpos, name)
     text = inspect.getdoc(thing)
-    for title in () if inspect.isclass(thing) else ("Parameters", "Returns"):
-        assert f"\n{title}\n{'-' * len(title)}\n" in text
+    titles = re.findall(r"^(\w+)\n-+$", text, re.MULTILINE)
+    if not inspect.isclass(thing):
+        assert {"Parameters", "Returns"} <= set(titles)
+    elif not issubclass(thing, Exception | Enum):
+        assert {"Attributes", "Parameters"} & set(titles)
     names = {"starpos": starpos, "np": np, "Path": Path}
     example = doctest.DocTestParser().get_doctest(text, names, name, None, 0)
     lines = []

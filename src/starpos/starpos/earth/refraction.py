@@ -29,6 +29,13 @@ LOW, LAYERS, AT_HORIZON = math.radians(10.0), math.radians(0.16), math.radians(2
 class Atmosphere:
     """The air at the instrument and how well it is known (1 sigma); InstrumentError for impossible values.
 
+    Attributes
+    ----------
+    pressure_pa, pressure_stddev_pa : Pa, not reduced to sea level; 0: a vacuum
+    temperature_c, temperature_stddev_c : deg C
+    humidity, humidity_stddev : relative, from 0 to 1
+    wavelength_um, wavelength_stddev_um : um, of the light that the camera sees
+
     Examples
     --------
     >>> air = starpos.Atmosphere(pressure_pa=88_000.0, temperature_c=12.0)
@@ -36,10 +43,8 @@ class Atmosphere:
     True
     """
 
-    # Not reduced to sea level; 0: a vacuum.
     pressure_pa: float = STANDARD_PRESSURE_PA
     temperature_c: float = STANDARD_TEMPERATURE_C
-    # From 0 to 1.
     humidity: float = 0.5
     wavelength_um: float = 0.55
     pressure_stddev_pa: float = 200.0

@@ -112,9 +112,14 @@ class InDegrees:
 @at_once
 @dataclass(frozen=True, kw_only=True)
 class PlaceFix:
-    """Astronomic latitude, longitude and heading (rad) at one time, with the budget of their errors.
+    """Astronomic latitude, longitude and heading at one time, with the budget of their errors.
 
-    The heading is NaN where none is known.
+    Attributes
+    ----------
+    utc_unix_s : s
+    latitude, longitude : rad, by the plumb line
+    heading : rad; NaN where none is known
+    terms : the sources of error, of which `covariance` is the sum
 
     Examples
     --------

@@ -116,10 +116,16 @@ class Solver:
 
     Other ways to identify a frame are in `starpos.fix.searching`.
 
-    catalogue: or the deeper one in its stead, for a field that needs it.
-    ephemeris: of the Sun, the Moon and planets.
-    hour_by_lens: whether the stars of a fisheye's frame at a place show its hour, with a lens fitted to them alone; None
-        for stamps that are surely UTC, as of a node's camera.
+    Attributes
+    ----------
+    instrument : camera, inclinometer, how both are mounted, and the clock
+    catalogue : or the deeper one in its stead, for a field that needs it
+    atmosphere : of refraction
+    min_stars : fewest identified stars of a fix
+    progress : is called with the share of the work that is done
+    ephemeris : of the Sun, the Moon and planets
+    hour_by_lens : whether the stars of a fisheye's frame at a place show its hour, with a lens fitted to them alone; None
+        for stamps that are surely UTC, as of a node's camera
 
     Examples
     --------

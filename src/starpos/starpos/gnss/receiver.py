@@ -101,6 +101,10 @@ class GnssTrack:
 
     Two places of one moment that contradict each other give none: two receivers, or a spoofed one.
 
+    Parameters
+    ----------
+    places : in any order, each with its time
+
     Examples
     --------
     >>> track = starpos.GnssTrack([starpos.Place.on_ellipsoid(35.7, 51.4, utc_unix_s=1.8e9)])

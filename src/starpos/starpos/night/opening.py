@@ -199,6 +199,14 @@ def truth_in(folder: Path) -> Truth | None:
 class NightOnDisk:
     """A folder of frames with tilt.csv, its instrument and air as far as `open_night` got them; `solve` solves it.
 
+    Attributes
+    ----------
+    folder, count : where the frames are, and how many
+    instrument : as given, or of the folder's file; None: by each frame's header
+    calibration, inclinometer : as given in place of the instrument's; None, '': the instrument's
+    atmosphere, vertical : of refraction, and the deflection of the vertical
+    place : where the frames were taken, for headings alone; None: it is sought
+
     Examples
     --------
     >>> night = starpos.open_night("night", instrument="instrument.yaml")

@@ -15,7 +15,12 @@ from starpos.sky.catalogue import Catalogue
 
 @dataclass(frozen=True)
 class Site:
-    """A place, by its astronomic latitude and longitude in deg, and its air.
+    """A place with its air.
+
+    Attributes
+    ----------
+    latitude_deg, longitude_deg : deg, astronomic
+    atmosphere : of refraction
 
     Examples
     --------

@@ -80,21 +80,25 @@ class Air:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DeflectionSession:
-    """The deflection of a session at the mark, arcsec, with its errors.
+    """The deflection of a session at the mark, with its errors.
 
-    sightings (N,): in order of time.
-    covariance_arcsec2 (2, 2): of xi, eta, the sum over sources of error, by_source (2, 2).
-    a3 (3, 3): C into S, with the tiltmeter's zero.
-    faces (N,): number of each frame's face.  frame_arcsec (N, 2): xi, eta of each frame minus the session's.
-    frame_stddev_arcsec (N, 2): what these should scatter by.
-    catalogue_factor: size of the catalogue's errors over what it states, by the session's own stars.
-    inclinometer: the errors that were assumed.
-    as_stated: the session with the errors of the tiltmeter's file, where the residuals show larger ones.  same_air:
-    likewise, with the air of this adjustment.  cost: -2 log of the likelihood.
-    chi2_per_degree: of the residuals; 1 where the stated errors and the air's explain them.
-    stars (S,): rows of the catalogue.
-    lines: the equations of the last step, before which the estimate was off the prior's by offset (5,).
-    projector (2 N, 2 N), weighted (2 N,): weights that the unknowns leave, and the weighted residuals.
+    Attributes
+    ----------
+    sightings : (N,) in order of time
+    xi_arcsec, eta_arcsec : arcsec, north and east
+    covariance_arcsec2 : (2, 2) of xi, eta, the sum over sources of error, by_source (2, 2)
+    a3 : (3, 3) C into S, with the tiltmeter's zero
+    faces : (N,) number of each frame's face
+    frame_arcsec, frame_stddev_arcsec : (N, 2) xi, eta of each frame minus the session's, and what they should scatter by
+    catalogue_factor : size of the catalogue's errors over what it states, by the session's own stars
+    inclinometer : the errors that were assumed
+    as_stated : the session with the errors of the tiltmeter's file, where the residuals show larger ones
+    same_air : likewise, with the air of this adjustment
+    cost : -2 log of the likelihood
+    chi2_per_degree : of the residuals; 1 where the stated errors and the air's explain them
+    stars : (S,) rows of the catalogue
+    lines : the equations of the last step, before which the estimate was off the prior's by offset (5,)
+    projector, weighted : (2 N, 2 N), (2 N,) weights that the unknowns leave, and the weighted residuals
 
     Examples
     --------
