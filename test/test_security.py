@@ -63,7 +63,6 @@ READS_WHOLE = {
     "starpos/frames/tables.py": "MAX_CSV_BYTES",
     "starpos/files.py": "of the package",
     "starpos/cli/demo.py": "what it has written",
-    "starpos/averaging/sights.py": "of the package",
     "starpos/instrument/phone_log.py": "texts that are unpacked within a limit",
     "starpos_bringup/bag.py": "installed messages",
     "starpos_dashboard/server.py": "of the package",
