@@ -76,6 +76,7 @@ def message_to_gnss(message: Any, unstated_m: float = math.nan) -> Place:
             f"GNSS's frame_id {message.header.frame_id[:40]!r} names another datum than WGS 84: set the receiver to that"
         )
     covariance = np.reshape(np.array(message.position_covariance, float), (3, 3))[:2, :2]
+    covariance = (covariance + covariance.T) / 2
     stated = np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0
     if message.position_covariance_type == 0 or not stated:
         covariance = np.eye(2) * unstated_m**2
@@ -92,6 +93,8 @@ def _names_other_datum(frame_id: str) -> bool:
 NEAREST_S = 3.0
 # Maximum speed of a vehicle between two places, m/s, and tolerance beyond it, in sigma of both.
 MAX_SPEED, SIGMAS = 150.0, 8.0
+# Minimum time between two places that show the speed: the noise of nearer ones would be a speed.
+SPEED_S = 1.0
 # Stamps closer than this are one.
 SAME_S = 1e-4
 
@@ -141,9 +144,12 @@ class GnssTrack:
 
     def _carried(self, place: Place, utc_unix_s: float) -> Place:
         """A place carried to a time after the last one, or before the first, with the error of that way."""
-        k = int(np.searchsorted(self._times, place.utc_unix_s))
-        other = self._places[k - 1] if k else self._places[1] if len(self._places) > 1 else place
-        span_s = max(abs(place.utc_unix_s - other.utc_unix_s), 1.0)
+        # the speed is by one that is a second before, or after the first: neighbours of a fast receiver are too near
+        k = int(np.searchsorted(self._times, place.utc_unix_s - SPEED_S)) - 1
+        if place.utc_unix_s <= self._times[0]:
+            k = int(np.searchsorted(self._times, place.utc_unix_s + SPEED_S))
+        other = self._places[min(max(k, 0), len(self._places) - 1)]
+        span_s = max(abs(place.utc_unix_s - other.utc_unix_s), SPEED_S)
         speed = float(np.linalg.norm(place.offset_m(other.latitude, other.longitude))) / span_s
         way_m = speed * (utc_unix_s - place.utc_unix_s)
         covariance = place.covariance + np.eye(2) * way_m**2

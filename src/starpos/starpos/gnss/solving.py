@@ -51,7 +51,8 @@ def watched(solver: Solver, stars: Stars, rough: Solution, gnss: Place | None, w
     gnss: that place, None without one.
     """
     if rough.fix is None:
-        compared = None if gnss is None else GnssCheck(status=GnssStatus.LEARNING, place=gnss)
+        status = GnssStatus.DISAGREES if watch.disagrees else GnssStatus.LEARNING
+        compared = None if gnss is None else GnssCheck(status=status, place=gnss)
         return Watched(solution=rough, compared=compared)
     watch.advance(rough.fix)
     up = _up(watch, rough.fix, gnss)

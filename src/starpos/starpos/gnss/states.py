@@ -20,6 +20,7 @@ from starpos.earth.vertical import Vertical
 from starpos.errors import GnssError
 from starpos.fix.fix import Fix
 from starpos.instrument.inclinometer import (
+    MAX_CELSIUS,
     RESPONSE_COEFFICIENTS,
     UNMEASURED_WALK_C_PER_SQRT_HOUR,
     Tilt,
@@ -289,7 +290,7 @@ def _learned(content: dict) -> Learned:
     if content.get(KEY) != VERSION:
         raise ValueError(f"{KEY} is not {VERSION}")
     axes = content["axes"]
-    if axes not in (2, 3):
+    if axes not in (2, 3) or not isinstance(axes, int):
         raise ValueError("axes is neither 2 nor 3")
     n = layout_of(axes).size
     arrays = {name: np.array(content[name], float) for name in ("a3", "calibrated_up", "state", "covariance")}
@@ -307,12 +308,20 @@ def _learned(content: dict) -> Learned:
         raise ValueError("its covariance is not symmetric and positive")
     if not np.allclose(a3 @ a3.T, np.eye(3), atol=1e-9) or np.linalg.det(a3) < 0:
         raise ValueError("a3 is no rotation")
+    if not abs(np.linalg.norm(arrays["calibrated_up"]) - 1) < 1e-6:
+        raise ValueError("calibrated_up is no direction")
     place, since, celsius = content["place_rad"], content["since_unix_s"], content["temperature_c"]
+    # files from before it was written have none
+    warmer_c = content.get("warmer_c", 0.0)
+    known = [v for v in (since, celsius) if v is not None]
+    known += [content["utc_unix_s"], content["frames"], content["poses"], warmer_c, *(place or ())]
+    possible = abs(place[0] if place else 0.0) <= np.pi / 2 and abs(celsius or 0.0) <= MAX_CELSIUS
+    if not np.isfinite(known).all() or not possible:
+        raise ValueError("its times, temperatures, place or counts are not possible numbers")
     return Learned(
         axes=axes,
         temperature_c=math.nan if celsius is None else float(celsius),
-        # files from before it was written have none
-        warmer_c=float(content.get("warmer_c", 0.0)),
+        warmer_c=float(warmer_c),
         utc_unix_s=float(content["utc_unix_s"]),
         place=None if place is None else (float(place[0]), float(place[1])),
         frames=int(content["frames"]),

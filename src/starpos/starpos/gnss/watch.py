@@ -127,6 +127,8 @@ WIDEST_M = 50_000.0
 # the place of a lean at which A3 was not learned may be bent by this share of its least sigma
 MAX_BENT = 0.3
 NOISE_SIGMA = 2.0
+# fewer poses are not believed more than a GNSS that contradicts them
+BELIEVED_POSES = 4
 # before A3 is known: maximum number of frames of a pose that teach, and of all that are kept
 FEW_OF_POSE, MAX_HELD = 12, 200
 # a place further off, in sigma, is another one, with a deflection of its own
@@ -167,6 +169,8 @@ class GnssCheck:
     @property
     def sentence(self) -> str:
         """Sentence that says the same."""
+        if math.isnan(self.distance_m) and self.status == GnssStatus.DISAGREES:
+            return "the stars give no place at this frame: GNSS is not believed, since an earlier one"
         if math.isnan(self.distance_m):
             return "A3 is learned from GNSS: the stars give no place of their own yet"
         where = COMPASS[round(self.bearing_deg / 45) % 8]
@@ -177,6 +181,11 @@ class GnssCheck:
 
 def _length_text(metres: float) -> str:
     return f"{metres:.0f} m" if metres < 1000 else f"{metres / 1000:.2g} km"
+
+
+def _readings_of(tilt: Tilt) -> frozenset[float]:
+    """The times of a tilt's readings; where they are not known, its own."""
+    return frozenset(tilt.times or (tilt.utc_unix_s,))
 
 
 class GnssWatch:
@@ -190,16 +199,18 @@ class GnssWatch:
 
     def __init__(self, instrument: Instrument, vertical: Vertical, learned: Learned | None = None) -> None:
         self.vertical, self._instrument = vertical, instrument
-        self._of_pose = 0
         self._pose: Fix | None = None
         self._new_pose = True
+        # of the frame that taught last, and of the one that the copies have compared last
         self._readings: frozenset[float] = frozenset()
+        self._compared: frozenset[float] = frozenset()
         self._begin(learned)
 
     def _begin(self, learned: Learned | None) -> None:
         """Begin with what is known, None of another inclinometer."""
         self.learned: Learned | None = learned
         self.is_learning, self.disagrees = learned is None, False
+        self._of_pose = 0
         self._held: deque[GnssFrame] = deque(maxlen=MAX_HELD)
         # the readings of a frame that would have been an alarm, before A3 was known
         self._suspicious: frozenset[float] | None = None
@@ -278,13 +289,21 @@ class GnssWatch:
         seen = innovation(sighting, gnss, self.learned, self.vertical)
         single = chi2(self.learned, seen)
         if self.is_learning:
-            return self._check(self._while_starting(single, sighting.tilt), sighting, gnss)
+            status = self._while_starting(single, sighting.tilt)
+            if status == GnssStatus.DISAGREES and self._rests_on_few(self.learned):
+                return self._begin_anew(sighting, gnss)
+            return self._check(status, sighting, gnss)
         if (onsets := self._onsets) is None:
             onsets = OnsetFilters.copied(self.learned)
         # while GNSS is not believed there is one filter
         elif not self.disagrees and onsets.due(sighting.utc_unix_s):
             onsets = joined([onsets, OnsetFilters.copied(self.learned)])
-        self._onsets = onsets = onsets.updated(seen, self.learned.state, sighting.utc_unix_s)
+        # the noise of a reading that frames share counts once: as of each of them, it would look like an error of GNSS
+        readings = _readings_of(sighting.tilt)
+        if not readings & self._compared:
+            onsets = onsets.updated(seen, self.learned.state, sighting.utc_unix_s)
+            self._compared = readings
+        self._onsets = onsets
         against = onsets.evidence(sighting.utc_unix_s)
         worst = max(single, float(against.max()))
         if self.disagrees and worst > BACK:
@@ -293,6 +312,8 @@ class GnssWatch:
         elif self.disagrees:
             agreed_s = sighting.utc_unix_s - onsets.since[0]
             self.disagrees = bool(agreed_s < BACK_S or onsets.frames[0] < BACK_FRAMES)
+        elif worst > ALARM and self._rests_on_few(self.learned):
+            return self._begin_anew(sighting, gnss)
         elif worst > ALARM:
             # where the frame alone raised the alarm, this is still the likeliest moment at which the error began
             self._take_back(onsets.before[max(int(np.argmax(against)) - 1, 0)], sighting)
@@ -300,9 +321,20 @@ class GnssWatch:
             return self._check(GnssStatus.DISAGREES, sighting, gnss)
         return self._check(GnssStatus.DOUBTFUL if worst > DOUBT else GnssStatus.AGREES, sighting, gnss)
 
+    def _rests_on_few(self, learned: Learned) -> bool:
+        """Whether A3 is known from a few poses of GNSS alone, and the present one has hardly borne it out."""
+        few = learned.poses < BELIEVED_POSES and self._of_pose < BACK_FRAMES
+        return few and self._instrument.calibration.unknown
+
+    def _begin_anew(self, sighting: Fix, gnss: Place) -> GnssCheck:
+        """Forget the little that GNSS taught and contradicts: a receiver that begins far off is one day right."""
+        check = self._check(GnssStatus.DISAGREES, sighting, gnss)
+        self._begin(None)
+        return check
+
     def _while_starting(self, single: float, tilt: Tilt) -> GnssStatus:
         """The status while A3 is hardly known: an alarm needs two frames without a common reading of the level."""
-        readings = frozenset(tilt.times)
+        readings = _readings_of(tilt)
         again = self._suspicious is not None and not (readings & self._suspicious)
         if single <= ALARM:
             self._suspicious = None
@@ -333,7 +365,7 @@ class GnssWatch:
 
     def learn(self, sighting: Fix, gnss: Place, check: GnssCheck) -> None:
         """Learn from a frame if GNSS is believed, and its readings are new."""
-        readings = frozenset(sighting.tilt.times)
+        readings = _readings_of(sighting.tilt)
         if check.status not in (GnssStatus.LEARNING, GnssStatus.AGREES) or readings & self._readings:
             return
         self._readings = readings

@@ -92,8 +92,8 @@ def message_to_trails(message: Any) -> list[FrameTrail]:
     trails = []
     for t in message.trails:
         ends, covariance = np.array(t.ends, float), np.array(t.covariance, float).reshape(4, 4)
-        if not (_is_possible(covariance, *ends) and (ends[:2] != ends[2:]).any()):
-            raise FrameError("trails: ends or covariance of a trail are impossible: measure it again.")
+        if not (_is_possible(covariance, *ends, t.snr) and (ends[:2] != ends[2:]).any()):
+            raise FrameError("trails: ends, covariance or SNR of a trail are impossible: measure it again.")
         trails.append(
             FrameTrail(
                 ends=ends.reshape(2, 2),

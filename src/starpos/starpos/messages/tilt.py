@@ -96,7 +96,8 @@ def _third_axis(message: Any) -> tuple[float, float]:
     real reading; such a tilt is refused, because the two differ by degrees.
     """
     z, variance = getattr(message, "z", math.nan), getattr(message, "z_variance", math.nan)
-    if math.isnan(z):
+    # infinite angles have no sine: a `Tilt` refuses them
+    if math.isnan(z) or not (math.isfinite(message.x) and math.isfinite(message.y)):
         return math.nan, math.nan
     if z == variance == 0:
         if math.sin(message.x) ** 2 + math.sin(message.y) ** 2 > 1 - SQUARE:

@@ -265,6 +265,8 @@ class FirstNight:
             np.arcsin(ups[:, 1]),
             np.full(len(ups), np.nan),
             self._solver.instrument.inclinometer.noise_rad,
+            # of a sensor that hangs, which has three axes
+            np.arcsin(ups[:, 2]) if (ups[:, 2] < 0).any() else None,
         )
         a3, remarks = turned(solver, frames, log, TURN_STDDEV_DEG)
         said = f"{found}; {'; '.join(remarks)}"

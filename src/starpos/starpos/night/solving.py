@@ -17,20 +17,21 @@ from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, GnssError
 from starpos.fix.attitude import heading_of
 from starpos.fix.budget import local_north
+from starpos.fix.fix import Fix
 from starpos.fix.glows import Glow
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver, placed
 from starpos.frames.frame import Frame, Stars
 from starpos.identification.prior import Hint
-from starpos.instrument.inclinometer import level_of, up_of
+from starpos.instrument.inclinometer import level_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night.night import Night, Shot, Truth, WatchedNight, why_none
 from starpos.night.together import FrameAnswer, Gathered, together, turned
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
-from starpos.rotation import half_turns
+from starpos.rotation import half_turns, normalised
 
 if TYPE_CHECKING:
     from starpos.gnss.receiver import GnssTrack
@@ -119,7 +120,8 @@ def answers_of(
     seen = [sight for _, sight in rows if isinstance(sight, Sight)]
     if not seen:
         return NightAnswers(each=_in_order(rows, ()))
-    solver = replace(asked.solver(seen[0].stars), progress=progress)
+    first = next((s for s in seen if asked.instruments.of(s.stars) is not None), seen[0])
+    solver = replace(asked.solver(first.stars), progress=progress)
     solver, alike = of_one_camera(solver, seen)
     if how.gnss is not None:
         watched = _watched_night(solver, alike, asked.tilts, how.gnss, how.learned, vertical)
@@ -265,7 +267,9 @@ def _steady(shots: Sequence[Shot], instrument: Instrument) -> np.ndarray | None:
     turned = np.abs(half_turns(headings - headings[0])).max()
     if len(tilts) < 3 or moved > STILL_SIGMA * noise + 1.0 or turned > np.radians(1.0):
         return None
-    g = level_of(up_of(tilts.mean(0))) @ instrument.calibration.a3
+    # not by two angles, of which a sensor that hangs has the same as one that stands
+    up = np.mean([s.place.tilt.up for s in shots if isinstance(s.place, Fix)], axis=0)
+    g = level_of(normalised(up)) @ instrument.calibration.a3
     steady = []
     for camera_to_itrs in attitudes:
         place = local_north(g @ camera_to_itrs.T)

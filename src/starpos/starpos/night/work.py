@@ -76,6 +76,11 @@ class Solving:
         if isinstance(self.tilts, ByGravity) and not self.tilts.has(item):
             begin, stars = time.process_time(), stars_of(item)
             sight = searching.Sight(stars, Solution.refused(stars, self.tilts.missing(item)))
+        elif self.instruments.cameras and self.instruments.of(item) is None:
+            # the frames of the cameras' sizes go on
+            begin, stars = time.process_time(), stars_of(item)
+            why = f"{item.place}: no camera_info is of its {item.width} x {item.height} px: state its instrument"
+            sight = searching.Sight(stars, Solution.refused(stars, InstrumentError(why)))
         elif self.instruments.sought and item.focal_px is None:
             begin = time.process_time()
             sight = self._by_sought_focal_length(item)

@@ -20,7 +20,7 @@ from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.gnss import states
 from starpos.gnss.filter import what_would_tell_more
-from starpos.gnss.receiver import NEAREST_S, GnssTrack, message_to_gnss
+from starpos.gnss.receiver import NEAREST_S, SPEED_S, GnssTrack, message_to_gnss
 from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssStatus, GnssWatch
@@ -85,9 +85,10 @@ class RecentPlaces:
 
     def at(self, utc_unix_s: float) -> Place | None:
         """The place at a time, None without one near; GnssError if the places there contradict each other."""
-        # with one more on either side, from which the speed is known
-        first = max(self._first_since(utc_unix_s - NEAREST_S) - 1, 0)
-        return GnssTrack(self._places[first : self._first_since(utc_unix_s + NEAREST_S) + 1]).at(utc_unix_s)
+        # with those on either side from which the speed is known
+        around_s = NEAREST_S + SPEED_S
+        first = max(self._first_since(utc_unix_s - around_s) - 1, 0)
+        return GnssTrack(self._places[first : self._first_since(utc_unix_s + around_s) + 1]).at(utc_unix_s)
 
     def forget(self) -> None:
         self._places.clear()

@@ -75,6 +75,20 @@ def test_an_error_may_be_taken_for_one_that_is_not_stated():
     assert message_to_gnss(message(kind=0), 30.0).covariance[0, 0] == 900.0
 
 
+@pytest.mark.parametrize("cross", [1.0, 5.0, 1e300])
+def test_a_covariance_of_which_one_half_is_filled_in_is_whole_or_no_covariance(cross):
+    """Its lower half alone was checked: with 1e300 m2 above it, a place was compared by no chi-square."""
+    for halves in ([[4.0, cross], [0.0, 9.0]], [[4.0, 0.0], [cross, 9.0]]):
+        covariance = np.diag([4.0, 9.0, 25.0])
+        covariance[:2, :2] = halves
+        if cross / 2 < 6.0:
+            found = message_to_gnss(message(covariance=covariance)).covariance
+            assert np.array_equal(found, found.T) and np.linalg.eigvalsh(found)[0] > 0
+        else:
+            with pytest.raises(GnssError, match="states no error"):
+                message_to_gnss(message(covariance=covariance))
+
+
 def test_metres_to_a_place_across_the_date_line():
     east = message_to_gnss(message(longitude=-179.999, latitude=0.5))
     here = message_to_gnss(message(longitude=179.999, latitude=0.5))

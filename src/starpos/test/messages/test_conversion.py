@@ -8,13 +8,22 @@ import numpy as np
 import pytest
 
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
+from starpos.gnss.receiver import message_to_gnss
 from starpos.messages.camera import leaves_size_open, message_to_camera
 from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
-from starpos.messages.stars import MAX_STARS, message_to_attitude, message_to_stars
+from starpos.messages.stars import (
+    MAX_STARS,
+    MAX_TRAILS,
+    message_to_attitude,
+    message_to_stars,
+    message_to_trails,
+)
 from starpos.messages.tilt import Reading, message_to_tilt
 
 HEADER = PlainHeader(PlainStamp(1_793_642_400, 250_000_000), "frame")
 UNSTAMPED = PlainHeader(PlainStamp(0, 0), "frame")
+TRAIL = SimpleNamespace(ends=[1.0, 2.0, 30.0, 40.0], covariance=np.eye(4).ravel() * 0.1, snr=9.0, flags=5)
+THIRD = math.asin(math.sqrt(1 - math.sin(0.1) ** 2 - math.sin(0.2) ** 2))
 STAR = SimpleNamespace(x=3.0, y=4.0, flux=100.0, snr=20.0, covariance=[0.01, 0.0, 0.0, 0.02], flags=1)
 TURN = SimpleNamespace(x=0.0, y=0.0, z=math.sin(0.1), w=math.cos(0.1))
 ROI = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0)
@@ -26,12 +35,22 @@ WHOLE = {
              "z": math.nan, "z_variance": math.nan, "flags": 0},
     "camera": {"header": HEADER, "k": [100.0, 0, 4.5, 0, 100.0, 3.5, 0, 0, 1], "d": [], "distortion_model": "",
                "width": 10, "height": 8, "roi": ROI, "binning_x": 0, "binning_y": 0},
+    "trails": {"header": HEADER, "trails": [TRAIL]},
+    "gnss": {"header": HEADER, "status": SimpleNamespace(status=0), "latitude": 47.0, "longitude": 8.0,
+             "position_covariance": np.diag([4.0, 9.0, 25.0]).ravel(), "position_covariance_type": 2},
 }  # fmt: skip
+# tilts whose third axis is filled in, or left at 0
+WHOLE["three axes"] = WHOLE["tilt"] | {"z": THIRD, "z_variance": 1e-9}
+WHOLE["third axis left at 0"] = WHOLE["tilt"] | {"z": 0.0, "z_variance": 0.0}
 READERS = {
     "stars": message_to_stars,
     "attitude": message_to_attitude,
     "tilt": message_to_tilt,
     "camera": message_to_camera,
+    "trails": message_to_trails,
+    "gnss": message_to_gnss,
+    "three axes": message_to_tilt,
+    "third axis left at 0": message_to_tilt,
 }
 
 
@@ -64,6 +83,11 @@ def star(**changed):
         ("tilt", {"x": 1.2, "y": 1.2}, TiltError, "tilt"),
         ("tilt", {"covariance": [1e-9, 5e-9, 5e-9, 1e-9]}, TiltError, "positive"),
         ("tilt", {"covariance": [2.0, 0, 0, 2.0]}, TiltError, "beyond 1 rad2"),
+        ("tilt", {"x": math.inf, "z": 0.0, "z_variance": 0.0}, TiltError, "finite"),
+        ("tilt", {"x": 1.3, "z": 0.0, "z_variance": 0.0}, TiltError, "on its side"),
+        ("trails", {"trails": [TRAIL] * (MAX_TRAILS + 1)}, FrameError, "brightest"),
+        ("trails", {"trails": [SimpleNamespace(**(vars(TRAIL) | {"ends": [1.0, 2.0, 1.0, 2.0]}))]}, FrameError, "ends"),
+        ("trails", {"trails": [SimpleNamespace(**(vars(TRAIL) | {"snr": math.nan}))]}, FrameError, "SNR"),
         ("tilt", {"z": math.inf}, TiltError, "finite"),
         ("tilt", {"z": 0.9, "z_variance": -1.0}, TiltError, "z_variance"),
         ("camera", {"k": [0.0] * 9}, InstrumentError, "not calibrated"),
@@ -77,6 +101,53 @@ def test_what_cannot_be_right_is_refused_by_name(kind, changed, error, said):
     read(kind)
     with pytest.raises(error, match=said):
         read(kind, **changed)
+
+
+# numbers that are whole in their messages; numbers that may be NaN or infinity, where they are unknown
+COUNTED = {"sec", "nanosec", "flags", "width", "height", "x_offset", "y_offset", "binning_x", "binning_y", "status",
+           "stars_matched", "position_covariance_type"}  # fmt: skip
+UNCHECKED = {"temperature", "z", "z_variance", "log_odds", "position_covariance"}
+
+
+def numbers_in(message, *path):
+    """The way to each number of a message: names of fields, and positions in lists."""
+    if isinstance(message, (int, float, np.number)):
+        yield path
+    elif isinstance(message, dict):
+        for name, value in message.items():
+            yield from numbers_in(value, *path, name)
+    elif isinstance(message, (list, np.ndarray)):
+        for k, value in enumerate(message):
+            yield from numbers_in(value, *path, k)
+    elif not isinstance(message, str):
+        yield from numbers_in(vars(message), *path)
+
+
+def spoilt(message, path, value):
+    """The message with another number there."""
+    if not path:
+        return value
+    first, *rest = path
+    if isinstance(message, dict):
+        return message | {first: spoilt(message[first], rest, value)}
+    if isinstance(message, (list, np.ndarray)):
+        return [spoilt(v, rest, value) if k == first else v for k, v in enumerate(message)]
+    return SimpleNamespace(**spoilt(vars(message), path, value))
+
+
+@pytest.mark.parametrize("kind", WHOLE)
+def test_any_number_that_is_spoilt_gives_a_value_without_nan_or_an_error_of_one_sentence(kind):
+    """A driver may send anything: what is read is never an exception of another kind, which would end a node."""
+    read(kind)
+    for path in numbers_in(WHOLE[kind]):
+        counted = path[-1] in COUNTED
+        for value in (0, 1, 255) if counted else (math.nan, math.inf, -math.inf, -1.0, 0.0, 1.0, 100.0):
+            try:
+                found = READERS[kind](SimpleNamespace(**spoilt(WHOLE[kind], path, value)))
+            except StarposError as error:
+                assert str(error) and "\n" not in str(error)
+                continue
+            assert found is not None and (math.isfinite(value) or UNCHECKED & set(path)), path
 
 
 def test_the_first_releases_messages_of_stars_and_tilts_are_read():

@@ -23,6 +23,7 @@ from starpos.night.remarks import worth_saving
 from starpos.night.solving import ONE_BY_ONE, Exposures, How, answers_of, solved_night
 from starpos.night.together import Gathered, together, turned
 from starpos.night.work import Solving
+from starpos.rotation import about_axis
 from starpos_testing.skies.scenes import (
     AIR,
     EXPOSURE,
@@ -276,3 +277,88 @@ def test_a_worker_is_not_sent_the_solver_and_its_catalogue(catalogue, rng):
     before = len(pickle.dumps(work))
     assert work.solver(stars) is work.solver(stars)
     assert len(pickle.dumps(work)) == before
+
+
+def sized(stars, width=800, height=600):
+    """The stars of a part of a frame, as of another camera."""
+    return replace(
+        stars.select(np.flatnonzero((stars.x < width - 1) & (stars.y < height - 1))),
+        width=width,
+        height=height,
+    )
+
+
+@pytest.mark.parametrize(
+    "how", [ONE_BY_ONE, How(180.0), How(gnss=GnssTrack([]))], ids=["alone", "turning", "gnss"]
+)
+@pytest.mark.parametrize("k", [0, 1])
+def test_a_frame_of_another_size_costs_its_own_answer_alone(catalogue, how, k):
+    """A frame of a bag ended the whole night, with a sentence on a header that it has not."""
+    frames = Frames(catalogue, 3 * [40.0])
+    given, _ = Instruments(frames.instrument).framed(frames.stars[0])
+    cameras = {(1000, 700): frames.instrument.camera_for(1000, 700)}
+    items = [*frames.stars[:k], sized(frames.stars[1]), *frames.stars[k:]]
+    for instruments, said in (
+        (given, "of 1000 x 700 px"),
+        (replace(given, cameras=cameras, any_size=False), "no camera_info"),
+    ):
+        frames.work = replace(frames.work, instruments=instruments)
+        night = solved_night(frames.exposures(items), how)
+        assert [s.status is Status.OK for s in night.shots] == [j != k for j in range(4)]
+        assert said in night.shots[k].message and frames.is_here(night.combined)
+
+
+def test_a_sensor_that_hangs_has_the_same_steady_places(catalogue):
+    """X' and Y' alone say that it stands: its places lay on the other hemisphere."""
+    hanging, frames = about_axis(0, np.pi), Frames(catalogue, 3 * [40.0])
+    tilts = {}
+    for at, tilt in frames.work.tilts.tilts.items():
+        x, y, z = np.arcsin(hanging @ tilt.up)
+        tilts[at] = replace(tilt, theta_x=x, theta_y=y, theta_z=z)
+    known = replace(frames.instrument, calibration=KNOWN.turned_to(hanging @ KNOWN.a3))
+    frames.work = replace(frames.work, instruments=Instruments(known), tilts=TiltsByTime(tilts))
+    night = solved_night(frames.exposures())
+    here = [night.combined.latitude, night.combined.longitude, night.combined.heading]
+    assert np.abs(night.steady - here).max() < np.radians(0.01)
+
+
+def mixed(still, points, name):
+    """The frames of a night at rest, as they may come, and how many of them have a fix."""
+    s = still.stars
+    untimed = replace(s[1], mid_unix_s=None)
+    late = replace(s[2], mid_unix_s=s[2].mid_unix_s + 3600)
+    return {
+        "one": ([s[0]], 1),
+        "none": ([], 0),
+        "the other way round": (s[::-1], 3),
+        "one of them three times": ([s[0]] * 3, 3),
+        "half of them not found": ([points, s[0], points, s[1], UNREADABLE, s[2]], 3),
+        "nothing but points": ([points] * 3, 0),
+        "one without a time": ([s[0], untimed, s[2]], 2),
+        "tilts that end": ([s[0], s[1], late], 2),
+        "a hundred points and one frame": ([*[points.select(np.arange(3))] * 100, s[0]], 1),
+    }[name]
+
+
+NAMES = ["one", "none", "the other way round", "one of them three times", "half of them not found", "nothing but points",
+         "one without a time", "tilts that end", "a hundred points and one frame"]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "how", [ONE_BY_ONE, How(gnss=GnssTrack([])), How(180.0)], ids=["alone", "gnss", "turning"]
+)
+@pytest.mark.parametrize("name", NAMES)
+def test_whatever_frames_a_night_has_each_has_an_answer_and_the_claim_holds(still, points, name, how):
+    items, fixed = mixed(still, points, name)
+    night = solved_night(still.exposures(items), how)
+    assert len(night.shots) == len(items) and all(s.place or s.message for s in night.shots)
+    assert len(night.fixed) == fixed and (night.combined is None) == (fixed == 0) == bool(night.why_not)
+    if night.combined is None:
+        return
+    assert still.is_here(night.combined)
+    sigmas_m = [np.sqrt(np.trace(s.place.covariance[:2, :2])) for _, s in night.fixed]
+    whole_m = np.sqrt(np.trace(night.combined.covariance[:2, :2]))
+    assert whole_m <= 1.01 * max(sigmas_m)
+    # the same frame once more adds nothing
+    if name == "one of them three times" and how.turn_stddev_deg is None:
+        assert whole_m == pytest.approx(min(sigmas_m), rel=0.01)

@@ -98,6 +98,15 @@ def test_the_middle_of_an_exposure_has_its_place_whatever_the_receivers_rate(rat
     assert len(places._places) <= 2 * KEPT_S * rate_hz + 1
 
 
+@pytest.mark.parametrize("rate_hz", [1, 5, 20])
+def test_a_place_after_the_last_one_errs_by_the_vehicles_speed_whatever_the_receivers_rate(rate_hz):
+    """27 m/s: all but the places of the last moments are left out of the comparison, which once hid the speed."""
+    places = RecentPlaces()
+    for k in range(20 * rate_hz + 1):
+        places.receive(fix(k / rate_hz, latitude=47.0 + NORTH_3_KM * k / rate_hz / 110), now(k / rate_hz))
+    assert math.sqrt(places.at(START_S + 22.8).covariance[1, 1]) == pytest.approx(76, rel=0.05)
+
+
 def test_two_receivers_on_one_topic_are_compared_with_nothing(teacher):
     for k in range(6):
         teacher.receive(fix(float(k), latitude=47.0 + NORTH_3_KM * (k % 2)), now(float(k)))
