@@ -50,7 +50,7 @@ SHOWN = 20
 # At once: on two cores, because tests of nodes mostly wait.
 LANES = 6
 # a folder's files in several parts, which run as lanes are free
-PARTS = {"graph": 6, "starpos": 8, "starpos_camera": 3, "starpos_inclinometer": 2}
+PARTS = {"graph": 6, "starpos": 6, "starpos_camera": 2, "starpos_inclinometer": 2}
 # with Ubuntu's versions less is run
 UBUNTU_PARTS = {"starpos": 2}
 # for several at once: a thread without a processor of its own makes the others wait for it; OpenBLAS's compute meanwhile
