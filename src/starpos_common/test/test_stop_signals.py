@@ -19,7 +19,7 @@ print("sending", flush=True)
 while os.getppid() == {0}:
     os.kill({0}, signal.SIGINT)
 """
-# About one in a hundred signals that are heard comes in the change: none of so many does in one case of 150.
+# About one in a hundred signals that are heard comes in the change; of 500 none does in one run of 150.
 HEARD = 500
 
 

@@ -136,7 +136,7 @@ def test_the_place_of_an_instrument_whose_a3_nobody_knows(catalogue, rng, headin
     "unmeasured", [(), (2,), range(24)], ids=["all measured", "one missing", "none measured"]
 )
 def test_a_claim_holds_while_the_inclinometer_cools(catalogue, rng, unmeasured):
-    """By 6 C an hour, with 20 arcsec per deg C: 1.5 km in the 24 minutes of a turn."""
+    """A drift of 20 arcsec per deg C at 6 C an hour: 1.5 km in the 24 minutes of a turn."""
     errors = replace(SCA100T_CALIBRATED, temperature_rad_per_c=20 * ARCSEC)
     sigmas = []
     for _ in range(4):
