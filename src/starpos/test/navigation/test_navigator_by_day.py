@@ -29,7 +29,7 @@ def model(tmp_path_factory):
 
 def drive(seed):
     """A rover in the morning, under a Sun that rises by 13 arcsec a second."""
-    return made("rover", SECONDS, seed, rate_hz=25, latitude_deg=20.0, longitude_deg=-38.0, mount_deg=0.1)
+    return made("rover", SECONDS, seed, rate_hz=50, latitude_deg=20.0, longitude_deg=-38.0, mount_deg=0.1)
 
 
 def sun_message(record, k, rng, lamp=None):
@@ -143,7 +143,7 @@ def test_a_lamp_gives_no_heading(model, higher_deg, away_m):
 
 def test_the_sun_near_the_zenith_gives_headings_within_their_claims(model):
     """The place is known and settles at once: the heading takes more rounds, most where the Sun is high."""
-    record = made("rover", SECONDS, 5, rate_hz=25, latitude_deg=-17.0, longitude_deg=22.0, mount_deg=0.1)
+    record = made("rover", SECONDS, 5, rate_hz=50, latitude_deg=-17.0, longitude_deg=22.0, mount_deg=0.1)
     events = without(record, "attitude", "velocity") + by_day(record) + gnss(record)
     navigator = Navigator(imu_model=model, mount_stddev=0.1, **{"gnss.use": True}).play(events)
     pull, claim = pulls(navigator.outputs, record)
