@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A ROS domain of this session's own, the graph's other end, and a solver that a file's tests share."""
 
+import gc
 import json
 import subprocess
 import sys
@@ -32,6 +33,12 @@ kept = DurabilityPolicy.TRANSIENT_LOCAL if latched == "latched" else DurabilityP
 node.create_subscription(TFMessage, topic, on_message, QoSProfile(depth=1000, durability=kept))
 rclpy.spin(node)
 """
+
+
+def pytest_collection_finish():
+    """Modules and tests stay to the end: the collector need not look at them again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

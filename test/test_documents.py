@@ -196,9 +196,17 @@ def said_beside_the_code(source: Path) -> list[str]:
     comments = [
         t.string for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type == tokenize.COMMENT
     ]
-    holders = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    docstrings = (ast.get_docstring(node) for node in ast.walk(ast.parse(text)) if isinstance(node, holders))
+    docstrings = (ast.get_docstring(node) for node in with_docstrings(ast.parse(text)))
     return [*comments, *filter(None, docstrings)]
+
+
+def with_docstrings(node: ast.AST):
+    """Modules, classes and functions; no expression holds any."""
+    if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+        yield node
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, ast.expr):
+            yield from with_docstrings(child)
 
 
 def not_there(text: str, source: Path) -> list[str]:

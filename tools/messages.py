@@ -56,7 +56,7 @@ def error_names() -> set[str]:
     names, bases = {"StarposError"}, {}
     for folder in (LIBRARY, *NODES):
         for tree in modules(folder).values():
-            for node in ast.walk(tree):
+            for node in tree.body:
                 if isinstance(node, ast.ClassDef):
                     bases[node.name] = {ast.unparse(base).split(".")[-1] for base in node.bases}
     while more := {name for name, of in bases.items() if of & names} - names:

@@ -9,7 +9,7 @@ import ast
 import inspect
 import re
 import sys
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -132,11 +132,15 @@ def comments(definition: str) -> Iterator[tuple[int, str]]:
 
 def said(source: str) -> Iterator[tuple[int, str]]:
     """Paragraphs of docstrings, and comments; those on successive lines are one."""
-    for node in ast.walk(ast.parse(source)):
+    left: deque[ast.AST] = deque([ast.parse(source)])
+    while left:
+        node = left.popleft()
         match node:
             case ast.Expr(ast.Constant(str(text))):
                 for paragraph in PARAGRAPH.split(inspect.cleandoc(text)):
                     yield node.lineno, " ".join(paragraph.split())
+        # no expression holds a statement
+        left.extend(child for child in ast.iter_child_nodes(node) if not isinstance(child, ast.expr))
     begun, last, gathered = 0, 0, ""
     number, counted = 1, 0
     for found in COMMENT.finditer(source):

@@ -7,7 +7,6 @@ setup(
     name=package,
     version="0.4.0",
     packages=[package],
-    package_data={package: ["flake8.ini"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import gc
 import os
 from pathlib import Path
 
@@ -12,6 +13,12 @@ os.environ |= dict.fromkeys(BLAS_THREADS, "1")
 import numpy as np
 
 SHARED = Path(__file__).resolve().parents[4] / "shared"
+
+
+def pytest_collection_finish():
+    """Modules and tests stay to the end: the collector need not look at them again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

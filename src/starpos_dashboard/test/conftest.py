@@ -38,7 +38,7 @@ def node(listener):
     assert status == 0 and "Traceback" not in output, output
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def driver(tmp_path_factory):
     require("selenium")
     for program, package in (("chromium", "chromium"), ("chromedriver", "chromium-driver")):
@@ -63,10 +63,10 @@ def page(driver, node, listener):
     page.instrument.works()
     driver.get_log("performance"), driver.get_log("browser")
     driver.get(node)
-    page.run("localStorage.clear()")
-    driver.get(node)
     page.shows(status_word="Fix")
     yield page
+    # the next test's page remembers nothing
+    page.run("localStorage.clear()")
     events = [json.loads(entry["message"])["message"] for entry in driver.get_log("performance")]
     asked = [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
     assert asked and all(url.startswith(node + "/") for url in asked), asked

@@ -31,6 +31,7 @@ def turned(
     lean=0.0,
     cooling=None,
     inclinometer=SCA100T_CALIBRATED,
+    step_s=60.0,
 ):
     """Frames at these azimuths of an instrument with an unknown A3, its tilts, and the scene.
 
@@ -42,7 +43,7 @@ def turned(
         scene = wide_scene(pointing_deg=(azimuth, 78.0 + lean * np.cos(np.radians(azimuth)), 15.0))
         instrument = replace(scene.instrument, calibration=Calibration(misalignment_deg=misalignment))
         scene = replace(scene, instrument=instrument)
-        begin = START + 60.0 * n
+        begin = START + step_s * n
         stars, tilt = stars_of(scene, catalogue, rng, begin), tilt_of(scene, rng, begin)
         frames.append(stars)
         zero, about = np.radians(zero_deg), {"utc_unix_s": stars.mid_unix_s}
@@ -133,15 +134,17 @@ def test_the_place_of_an_instrument_whose_a3_nobody_knows(catalogue, rng, headin
 
 
 @pytest.mark.parametrize(
-    "unmeasured", [(), (2,), range(24)], ids=["all measured", "one missing", "none measured"]
+    "unmeasured", [(), (2,), range(12)], ids=["all measured", "one missing", "none measured"]
 )
 def test_a_claim_holds_while_the_inclinometer_cools(catalogue, rng, unmeasured):
     """It cools by 6 C an hour, at 20 arcsec per deg C: 1.5 km in the 24 minutes of a turn."""
     errors = replace(SCA100T_CALIBRATED, temperature_rad_per_c=20 * ARCSEC)
     sigmas = []
     for _ in range(4):
-        cooling = np.linspace(12.0, 9.6, 24), rng.normal(0, 20 / 3600, 2), unmeasured
-        answer, scene = turned(catalogue, rng, range(0, 360, 15), cooling=cooling, inclinometer=errors)
+        cooling = np.linspace(12.0, 9.6, 12), rng.normal(0, 20 / 3600, 2), unmeasured
+        answer, scene = turned(
+            catalogue, rng, range(0, 360, 30), cooling=cooling, inclinometer=errors, step_s=120.0
+        )
         sigmas.append(miss(average(answer.fixes), scene)[1])
     # two degrees of freedom: the mean square of four is below 6.7 but for once in a thousand
     assert np.mean(np.square(sigmas)) < 6.7, sigmas

@@ -46,7 +46,7 @@ def test_likelihood_is_that_of_all_covariances_together(side, rng):
 
 @cache
 def voyage_in(wind, seed):
-    record = made("drone", 900, seed, rate_hz=25, cadence_s=3.0, more_wind=wind)
+    record = made("drone", 900, seed, rate_hz=10, cadence_s=3.0, more_wind=wind)
     return record, navigated(record, "drone", velocity=False)
 
 
@@ -77,7 +77,7 @@ def test_a_steady_wind_is_not_believed_to_stay_so():
 
 
 def test_a_wind_that_changes_more_than_the_law_says_widens_the_claim():
-    record = made("drone", 900, 4, rate_hz=25, cadence_s=3.0, more_wind=walking_wind(0.05))
+    record = made("drone", 900, 4, rate_hz=10, cadence_s=3.0, more_wind=walking_wind(0.05))
     walking = navigated(record, "drone", velocity=False)
     assert any("change" in fault for fault in walking.faults)
     assert sigma_m(walking) > 1.5 * sigma_m(voyage_in(None, 5)[1])
