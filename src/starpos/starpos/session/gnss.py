@@ -77,8 +77,12 @@ class RecentPlaces:
         if ahead_s > AHEAD_S or -ANOTHER_TIME_S < ahead_s < -MAX_LATE_S:
             side = "ahead of" if ahead_s > 0 else "behind"
             raise GnssError(f"GNSS's stamps are {abs(ahead_s):.3g} s {side} this clock: {ONE_CLOCK}")
-        if self._places and place.utc_unix_s < self._places[-1].utc_unix_s:
+        back_s = self._places[-1].utc_unix_s - place.utc_unix_s if self._places else 0.0
+        if 0 < back_s < ANOTHER_TIME_S:
             raise GnssError("GNSS's stamps go back: check that one receiver publishes, not two")
+        if back_s > 0:
+            # the stamps before were of another time
+            self.forget()
         self._places.append(place)
         if self._places[0].utc_unix_s < place.utc_unix_s - 2 * KEPT_S:
             del self._places[: self._first_since(place.utc_unix_s - KEPT_S)]

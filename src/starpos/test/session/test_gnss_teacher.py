@@ -83,6 +83,13 @@ def test_stamps_that_go_back_are_refused(teacher):
     assert teacher.account.taken == 2 and "stamps go back" in teacher.account.refused[0]
 
 
+def test_one_stamp_of_another_time_costs_no_right_ones(teacher):
+    for seconds in (0.0, 7200.0, 2.0, 3.0):
+        teacher.receive(fix(seconds), now(min(seconds, 3.0)))
+    assert teacher.account.taken == 4 and teacher.places.at(START_S + 2.5) is not None
+    assert teacher.places.newest.utc_unix_s == START_S + 3.0
+
+
 @pytest.mark.parametrize("rate_hz", [1, 5, 10, 20])
 @pytest.mark.parametrize("exposure_s", [2.0, 30.0, 120.0])
 def test_the_middle_of_an_exposure_has_its_place_whatever_the_receivers_rate(rate_hz, exposure_s):
