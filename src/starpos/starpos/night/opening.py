@@ -256,15 +256,13 @@ class NightOnDisk:
             model, errors = sensors.find(self.inclinometer)
             given = replace(given, inclinometer=errors, inclinometer_model=model)
         instruments = Instruments(given, by_header=self.instrument is None, sought=sought)
+        night = exposures(self.folder, instruments, self.atmosphere, self.vertical, self.place)
         if isinstance(gnss, (str, Path)):
             from starpos.gnss.receiver import read_gnss_csv
 
-            gnss, _ = read_gnss_csv(gnss)
-        return solved_night(
-            exposures(self.folder, instruments, self.atmosphere, self.vertical, self.place),
-            How(turn_stddev_deg if self_calibrate else None, gnss),
-            progress,
-        )
+            gnss, left_out = read_gnss_csv(gnss)
+            night = replace(night, remarks=(*night.remarks, *left_out))
+        return solved_night(night, How(turn_stddev_deg if self_calibrate else None, gnss), progress)
 
 
 def open_night(

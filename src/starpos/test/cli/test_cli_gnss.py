@@ -6,8 +6,11 @@ import csv
 import pytest
 from cli_calls import AIR, PLACE, WIDE, objects
 
+import starpos
 from starpos.cli import main
+from starpos.instrument.instrument import Instrument
 from starpos_testing.command_line import SENSOR, run
+from starpos_testing.skies.scenes import FOCAL_PX
 
 HEAD = "utc_unix_s,latitude,longitude,altitude_m,sigma_east_m,sigma_north_m,status"
 
@@ -73,6 +76,15 @@ def test_without_tilts_there_are_headings(drive, capsys):
 def test_options_that_contradict_each_other_are_refused(drive, capsys, options, said):
     status, _, errors = solve(capsys, drive, *options)
     assert status == 2 and said in errors[0]
+
+
+def test_the_library_says_which_rows_of_gnss_are_left_out(drive, tmp_path):
+    head, *rows = (drive / "gnss.csv").read_text().splitlines()
+    broken = rows[0].split(",")
+    broken[1] = "nan"
+    (tmp_path / "gnss.csv").write_text("\n".join([head, *rows, ",".join(broken)]) + "\n")
+    night = starpos.open_night(drive, instrument=Instrument(FOCAL_PX)).solve(gnss=tmp_path / "gnss.csv")
+    assert any("gnss.csv: 1 row" in remark for remark in night.remarks), night.remarks
 
 
 def test_learned_needs_gnss(drive, tmp_path, capsys):
