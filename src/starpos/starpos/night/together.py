@@ -4,7 +4,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,12 +12,13 @@ import numpy as np
 from starpos.averaging.altitudes import MIN_JUDGED, Directions, place_of_circles, place_of_discs
 from starpos.averaging.average import Average, average
 from starpos.averaging.elevation_axis import MIN_WITHOUT_SITE, FoundAxis, find_axis
+from starpos.averaging.poses import MeanAttitude
 from starpos.calibration.misalignment import Calibrated, turn
 from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, StarposError
 from starpos.fix.checks import unknown_a3, unnamed_inclinometer
 from starpos.fix.circle import Circle, circle_of
-from starpos.fix.fix import IDEAL, Fix
+from starpos.fix.fix import IDEAL, Fix, PlaceFix
 from starpos.fix.searching import Sight
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
@@ -108,12 +109,20 @@ class Together:
     """The average of a night's fixes, None if it is missing, as why_not says; and remarks on it.
 
     axis: A3's, which elevations determined too; None if A3 was known well enough or they do not determine it.
+    mean: attitude at a known place; None without one.  gathered: of the answers; nothing of elevations alone.
     """
 
     average: Average | None = None
     why_not: str = ""
     remarks: tuple[str, ...] = ()
     axis: FoundAxis | None = None
+    mean: MeanAttitude | None = None
+    gathered: Gathered = field(default_factory=Gathered)
+
+    @property
+    def where(self) -> PlaceFix | None:
+        """The average, or else the last fix; None without any."""
+        return self.average or next(reversed(self.gathered.fixes), None)
 
     @classmethod
     def by_circles(cls, place: Average, near: Near | None) -> "Together":
