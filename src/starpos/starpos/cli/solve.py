@@ -33,7 +33,7 @@ from starpos.night.reading import NO_CAMERA, Instruments
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, worth_saving
 from starpos.night.solving import How, NightAnswers, answers_of, answers_of_pointings
 from starpos.night.together import FrameAnswer, Together, from_elevations
-from starpos.night.work import Solving
+from starpos.night.work import Solving, prepare
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
@@ -347,5 +347,5 @@ def _work(
     assert work.instruments.instrument is not None
     if not work.instruments.sought:
         check_save(args, work.instruments.instrument)
-    inputs.prepare(work.instruments, about)
+    console.complain(prepare(work.instruments, about, console.ProgressBar()))
     return replace(work, tilts=NO_TILTS) if own_level else work

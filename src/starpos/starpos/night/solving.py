@@ -5,9 +5,9 @@ Frames are solved one by one, or all together: by turning, or compared with GNSS
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,13 +23,13 @@ from starpos.fix.glows import Glow
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver, placed
-from starpos.frames.frame import Frame, Stars
 from starpos.frames.tables import Pointing
 from starpos.identification.prior import Hint
 from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night.night import Night, Shot, Truth, WatchedNight, why_none
+from starpos.night.reading import Each
 from starpos.night.remarks import Near
 from starpos.night.together import FrameAnswer, Gathered, Together, together, turned
 from starpos.night.work import Solving
@@ -44,9 +44,6 @@ if TYPE_CHECKING:
 # if readings are further from their median than this, the camera was moved
 STILL_SIGMA = 8.0
 
-# the names of frames, and what a work made of each, or why it cannot be read
-Worked = Iterator[tuple[str, Any]]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Exposures:
@@ -59,7 +56,7 @@ class Exposures:
     name: str
     origin: str
     count: int
-    each: Callable[[Callable[[Frame | Stars], Any]], Worked]
+    each: Each
     work: Solving
     vertical: Vertical
     truth: Truth | None = None

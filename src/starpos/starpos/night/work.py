@@ -244,6 +244,19 @@ def identify(
     return Solving(given, search_s=search_s, progress=progress)(item).solution
 
 
+def prepare(given: Instruments, about: Stars, progress: Progress = quiet) -> str:
+    """Put the tables of a field, or of any, into the cache, for all processes; a sentence on what the catalogue lacks."""
+    stars = catalogue.load_catalogue()
+    if given.instrument is None or given.sought:
+        BlindSolver(stars, progress).prepare()
+        return ""
+    # the frames report the error
+    with suppress(StarposError):
+        solver = Solver(given.instrument, stars, progress=progress)
+        return solver.prepare(about.width, about.height, about.origin_px)
+    return ""
+
+
 def trails_seen(
     solving: Solving, item: Frame | Stars
 ) -> "tuple[searching.Sight, list[SatelliteTrail], str] | Solution":
