@@ -245,7 +245,7 @@ def _run_sights(args: argparse.Namespace) -> int:
             place = place_of_sights(used, seen, None if near is None else near.place)
             whole = Together.by_circles(place, near)
         except StarposError as error:
-            whole = Together(None, str(error))
+            whole = Together(why_not=str(error))
     return fix_output.tell_elevations(args, output, sights, circles, whole, vertical, near)
 
 

@@ -23,7 +23,7 @@ from starpos.zenith.adjustment import DeflectionSession
 from starpos.zenith.doubts import checked_session, remarks
 from starpos.zenith.sighting import ZenithSighting, sighting
 
-# the sighting of each frame by its name, or why it has none
+# names of frames, and their sightings or what is wrong with them
 Sightings = list[tuple[str, ZenithSighting | Solution | FrameError]]
 
 
@@ -55,7 +55,7 @@ def session_of(
 ) -> tuple[DeflectionSession, Sightings]:
     """The session of the frames through which `each` goes, by the instruments, tilts and air given.
 
-    say: is told what looks wrong.  FixError if the sightings do not bear a deflection.
+    say: takes what looks wrong.  FixError if the sightings do not bear a deflection.
     """
     instrument = given.instruments.instrument
     assert instrument is not None

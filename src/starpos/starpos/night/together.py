@@ -104,7 +104,7 @@ class Gathered:
         return [s.fix for s in self.solved if s.fix is not None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Together:
     """The average of a night's fixes, None if it is missing, as why_not says; and remarks on it.
 
@@ -128,7 +128,7 @@ class Together:
     def by_circles(cls, place: Average, near: Near | None) -> "Together":
         """The place where circles meet, and what looks wrong with it."""
         said = *remarks.of_average(place), *doubts((), place, None, near)
-        return cls(place, "", tuple(filter(None, said)))
+        return cls(average=place, remarks=tuple(filter(None, said)))
 
 
 def together(gathered: Gathered, given: Instrument | None, near: Near | None = None) -> Together:
@@ -157,7 +157,7 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
         said += [remarks.of_copies(fixes)] if given.has_level_inside else []
     said += [] if gathered.mark is None else [remarks.of_mark(place, gathered.mark)]
     said += doubts(fixes, place, a3, near or gathered.site)
-    return Together(whole, why_not, tuple(filter(None, said)))
+    return Together(average=whole, why_not=why_not, remarks=tuple(filter(None, said)))
 
 
 def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
@@ -170,7 +170,7 @@ def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
             )
         place, _ = place_of_discs(circles, None if near is None else near.place)
     except FixError as error:
-        return Together(None, str(error))
+        return Together(why_not=str(error))
     return Together.by_circles(place, near)
 
 
@@ -236,9 +236,9 @@ def from_elevations(
             unnamed_inclinometer(solver.instrument),
             *doubts((), place, None, near),
         )
-        whole = Together(place, "", tuple(filter(None, said)), axis)
+        whole = Together(average=place, remarks=tuple(filter(None, said)), axis=axis)
     except FixError as error:
-        whole = Together(None, str(error), axis=axis)
+        whole = Together(why_not=str(error), axis=axis)
     if self_calibrate or axis is not None or not remarks.beyond_stated(whole.average):
         return circles, whole
     # residuals beyond the stated errors may come from a wrong A3, which no scatter covers

@@ -106,7 +106,7 @@ def voyage_of(
 ) -> tuple[list[VoyageFrame], Voyage]:
     """The frames, and their places by tables of an IMU and of velocities along the body's axes, if there are any.
 
-    about: the first of the frames, through which `each` goes.  say: is told what looks wrong.  assumed: for `vessel_of`.
+    about: the first of the frames, through which `each` goes.  say: takes what looks wrong.  assumed: for `vessel_of`.
 
     VoyageError for broken records, FixError where the stars do not support a place.
     """

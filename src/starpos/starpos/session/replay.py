@@ -187,7 +187,7 @@ class PlayedNight:
         if whole:
             a3 = self.instrument.calibration
             said.append(unknown_a3(a3, whole.covariance, whole.terms, BY_PARAMETERS))
-        return Together(whole, "", tuple(filter(None, said)), gathered=gathered)
+        return Together(average=whole, remarks=tuple(filter(None, said)), gathered=gathered)
 
 
 class _Said:
