@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starpos.averaging.elevation_axis import FoundAxis
-from starpos.averaging.sights import circle_of_sight, place_of_sights, read_sights
+from starpos.averaging.sights import read_sights
 from starpos.calibration.misalignment import Calibrated
 from starpos.cli import console, fix_output, inputs, options, overwriting, places_file
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import InstrumentError, StarposError, TiltError
-from starpos.fix.circle import Circle
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.frames.reading import are_photographs
@@ -32,7 +31,7 @@ from starpos.night.opening import work_of
 from starpos.night.reading import NO_CAMERA, Instruments
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, worth_saving
 from starpos.night.solving import How, NightAnswers, answers_of, answers_of_pointings
-from starpos.night.together import FrameAnswer, Together, from_elevations
+from starpos.night.together import FrameAnswer, from_elevations, from_sights
 from starpos.night.work import Solving, prepare
 from starpos.sky import catalogue
 from starpos.units import utc_text
@@ -231,21 +230,7 @@ def _run_sights(args: argparse.Namespace) -> int:
     air = options.atmosphere_of(args)
     ephemeris = options.ephemeris_of(args)
     output = console.Output(args, "elevations")
-    circles: list[Circle | StarposError] = []
-    for sight in sights:
-        try:
-            circles.append(circle_of_sight(sight, catalogue.load_catalogue(), air, clock_s, ephemeris))
-        except StarposError as error:
-            circles.append(error)
-    whole = Together()
-    sound = [(s, c) for s, c in zip(sights, circles, strict=True) if isinstance(c, Circle)]
-    if sound:
-        try:
-            used, seen = zip(*sound, strict=True)
-            place = place_of_sights(used, seen, None if near is None else near.place)
-            whole = Together.by_circles(place, near)
-        except StarposError as error:
-            whole = Together(why_not=str(error))
+    circles, whole = from_sights(sights, air, clock_s, near, ephemeris)
     return fix_output.tell_elevations(args, output, sights, circles, whole, vertical, near)
 
 

@@ -13,8 +13,10 @@ from starpos.averaging.altitudes import MIN_JUDGED, Directions, place_of_circles
 from starpos.averaging.average import Average, average
 from starpos.averaging.elevation_axis import MIN_WITHOUT_SITE, FoundAxis, find_axis
 from starpos.averaging.poses import MeanAttitude
+from starpos.averaging.sights import SextantSight, circle_of_sight, place_of_sights
 from starpos.calibration.misalignment import Calibrated, turn
 from starpos.earth.place import Place
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, FrameError, StarposError
 from starpos.fix.checks import unknown_a3, unnamed_inclinometer
 from starpos.fix.circle import Circle, circle_of
@@ -28,6 +30,8 @@ from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
 from starpos.night.remarks import Near, doubts
+from starpos.sky.bodies import ERFA, SolarSystem
+from starpos.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:
     from starpos.gnss.solving import Watched
@@ -247,6 +251,30 @@ def from_elevations(
     if free.axis is None or free.axis.directions < MIN_JUDGED or free.axis.sigma_from(given) < DENIED_SIGMA:
         return circles, whole
     return circles, replace(free, remarks=(remarks.of_denied_a3(free.axis, given), *free.remarks))
+
+
+def from_sights(
+    sights: Sequence[SextantSight],
+    atmosphere: Atmosphere,
+    clock_stddev_s: float,
+    near: Near | None = None,
+    ephemeris: SolarSystem = ERFA,
+) -> tuple[list[Circle | StarposError], Together]:
+    """Each sight's circle, or the error, and their place; near: selects between two places that two sights leave."""
+    circles: list[Circle | StarposError] = []
+    for sight in sights:
+        try:
+            circles.append(circle_of_sight(sight, load_catalogue(), atmosphere, clock_stddev_s, ephemeris))
+        except StarposError as error:
+            circles.append(error)
+    sound = [(s, c) for s, c in zip(sights, circles, strict=True) if isinstance(c, Circle)]
+    if not sound:
+        return circles, Together()
+    try:
+        place = place_of_sights(*zip(*sound, strict=True), None if near is None else near.place)
+    except StarposError as error:
+        return circles, Together(why_not=str(error))
+    return circles, Together.by_circles(place, near)
 
 
 def axis_of(
