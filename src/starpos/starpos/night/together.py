@@ -271,7 +271,8 @@ def from_sights(
     if not sound:
         return circles, Together()
     try:
-        place = place_of_sights(*zip(*sound, strict=True), None if near is None else near.place)
+        used, seen = zip(*sound, strict=True)
+        place = place_of_sights(used, seen, None if near is None else near.place)
     except StarposError as error:
         return circles, Together(why_not=str(error))
     return circles, Together.by_circles(place, near)
