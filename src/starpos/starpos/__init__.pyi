@@ -32,12 +32,14 @@ from starpos.instrument.tilt_table import read_tilt_csv as read_tilt_csv
 from starpos.navigation.estimate import VoyageFix as VoyageFix
 from starpos.navigation.voyage import Voyage as Voyage
 from starpos.night.at_mark import deflection as deflection
+from starpos.night.by_satellites import locate as locate
 from starpos.night.night import Night as Night
 from starpos.night.night import Shot as Shot
 from starpos.night.opening import NightOnDisk as NightOnDisk
 from starpos.night.opening import open_night as open_night
 from starpos.night.under_way import navigate as navigate
 from starpos.night.work import identify as identify
+from starpos.satellites.locating import SatelliteFix as SatelliteFix
 from starpos.session.replay import PlayedNight as PlayedNight
 from starpos.session.replay import replay as replay
 from starpos.simulation.scene import scene_of as scene_of

@@ -86,6 +86,11 @@ class VoyageError(StarposError):
     """The record of a voyage (inertial readings, velocities) is missing or broken, or contradicts its stars."""
 
 
+def named(name: str, said: object) -> str:
+    """An error or a sentence on a frame, with its name before it unless it is in it."""
+    return str(said) if name in str(said) else f"{name}: {said}"
+
+
 def one_line(error: object) -> str:
     """The message of an error, or any text, on one line and short enough to be quoted in a sentence."""
     said = " ".join(str(error).split())

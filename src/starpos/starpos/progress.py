@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Long work: reports of its progress, and a limit of its CPU time."""
+"""Long work: reports of its progress, what it says meanwhile, and a limit of its CPU time."""
 
 import math
 import time
@@ -10,8 +10,12 @@ from dataclasses import dataclass
 Progress = Callable[[str, float], None]
 
 
-def quiet(what: str, done: float) -> None:
-    """Ignore a progress report."""
+# Called with sentences on what looks wrong, or '' where nothing does.
+Say = Callable[..., None]
+
+
+def quiet(*said: object) -> None:
+    """Ignore a progress report, or sentences."""
 
 
 @dataclass(frozen=True)

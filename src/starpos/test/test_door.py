@@ -15,6 +15,7 @@ import pytest
 
 import starpos
 from starpos.instrument.sensors import SCA100T_CALIBRATED
+from starpos_testing.skies import sightings
 from starpos_testing.skies.folders import write_drive, write_zenith_session
 from starpos_testing.voyages import made
 
@@ -105,6 +106,10 @@ def workplace(tmp_path_factory, catalogue):
         (folder / name).mkdir()
     write_drive(folder / "drive", catalogue, made("rover", 40, 2, cadence_s=4.0))
     write_zenith_session(folder / "zenith", catalogue)
+    satellites, elements = sightings.drawn(900, 7)
+    (folder / "active.tle").write_text(elements)
+    trails, _ = sightings.table(satellites, (47.0, 8.0, 900.0), np.random.default_rng(5), count=8)
+    (folder / "sightings.csv").write_text(trails)
     rows = "".join(f"{1.8e9 + k},35.7046,51.4106,2.0,2.0\n" for k in range(3))
     (folder / "gnss.csv").write_text("utc_unix_s,latitude,longitude,sigma_east_m,sigma_north_m\n" + rows)
     return folder

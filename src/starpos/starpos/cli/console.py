@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from starpos import cli
+from starpos.errors import named
 from starpos.files import rows_of
 
 OUTPUTS = Path(__file__).with_name("data") / "outputs.yaml"
@@ -83,11 +84,6 @@ def complain_of(night: str | None, *said: object) -> None:
     complain(*(each if night is None else f"{night}: {each}" for each in said if each))
 
 
-def named(name: str, said: str) -> str:
-    """A sentence on a frame, with its name before it unless it is in it."""
-    return said if name in said else f"{name}: {said}"
-
-
 class FrameComplaints:
     """Complains about frames: a sentence that is true of several, but for their names, is printed once."""
 
@@ -100,7 +96,7 @@ class FrameComplaints:
         alike = self._frames.setdefault(reason, [])
         alike.append(name)
         if len(alike) == 1:
-            complain(named(name, str(error)))
+            complain(named(name, error))
 
     def end(self) -> None:
         """Say how many more frames each sentence is true of."""

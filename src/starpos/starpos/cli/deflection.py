@@ -2,7 +2,6 @@
 """`starpos deflection`: the deflection of the vertical at a known site, from a zenith camera's frames and tilts."""
 
 import argparse
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +10,14 @@ from starpos.cli import console, inputs, options
 from starpos.earth.place import Place
 from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, InstrumentError, TiltError
-from starpos.fix.checks import unnamed_inclinometer
-from starpos.fix.solution import Solution
-from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
-from starpos.night.at_mark import zenith_seen
+from starpos.night.at_mark import session_of, why_none
 from starpos.night.bag import is_bag
 from starpos.night.opening import work_of
+from starpos.night.reading import Each
+from starpos.night.work import Solving, prepare
 from starpos.units import ARCSEC, utc_text
 from starpos.zenith.adjustment import DeflectionSession, FaceQuality, reduced
-from starpos.zenith.doubts import checked_session, remarks
 from starpos.zenith.sighting import ZenithSighting
 
 
@@ -121,27 +118,31 @@ def _face_text(face: dict) -> str:
 
 def run(args: argparse.Namespace) -> int:
     mark = _mark_of(args)
-    return _tell(args, _of_bag(args, mark) if _is_bag(args) else _of_files(args, mark), mark)
+    each, given = _of_bag(args) if _is_bag(args) else _of_files(args)
+    session, rows = session_of(each, given, mark, console.complain)
+    output, at = console.Output(args, "deflection"), {id(s): k for k, s in enumerate(session.sightings)}
+    for name, answer in rows:
+        if isinstance(answer, ZenithSighting):
+            value = frame_json(name, session, at[id(answer)])
+            output.put(value, frame_line(value))
+        else:
+            output.put({"file": name, "status": "left out", "message": why_none(name, answer)}, "")
+    whole = combined_json(session, reduced(session, mark), mark, args.station)
+    output.put(whole, combined_text(session, whole))
+    return console.UNREADABLE if any(isinstance(a, FrameError) for _, a in rows) else 0
 
 
-# a session's frames, each by name with its sighting or why it has none; the instrument
-_Taken = tuple[list[tuple[str, ZenithSighting | Solution | FrameError]], Instrument]
-
-
-def _of_files(args: argparse.Namespace, mark: Place) -> _Taken:
-    """The sightings of files."""
+def _of_files(args: argparse.Namespace) -> tuple[Each, Solving]:
+    """What goes through the frames of files, and the work on them."""
     if not args.frames or args.tilt is None:
         raise InstrumentError("give frames and --tilt CSV, or a bag")
     read, frames = inputs.reader_of(args), inputs.frames_among(args.frames, args.tilt)
     about = read.one_of(frames)
-    air = options.atmosphere_of(args)
-    given, remarks = work_of(inputs.given_of(args, about), about, Path(args.tilt), air)
-    console.complain(*remarks)
-    instrument = given.instruments.instrument
-    assert instrument is not None
-    inputs.prepare(given.instruments, about)
-    work = partial(read.on, partial(zenith_seen, given, mark))
-    return list(inputs.worked(args, work, frames, lines=False)), instrument
+    given, remarks = work_of(
+        inputs.given_of(args, about), about, Path(args.tilt), options.atmosphere_of(args)
+    )
+    console.complain(*remarks, prepare(given.instruments, about, console.ProgressBar()))
+    return inputs.each_of(args, read, frames, lines=False), given
 
 
 def _is_bag(args: argparse.Namespace) -> bool:
@@ -153,8 +154,8 @@ def _is_bag(args: argparse.Namespace) -> bool:
     return bool(bag)
 
 
-def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
-    """The sightings of a bag's frames."""
+def _of_bag(args: argparse.Namespace) -> tuple[Each, Solving]:
+    """What goes through a bag's frames, and the work on them."""
     path = Path(args.frames[0])
     night = inputs.bag_of(path, args, Deflection())
     console.complain(*night.remarks)
@@ -162,32 +163,7 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
         raise TiltError(f"{path}: no usable tilt in it: record the topic tilt too")
     if not night.count:
         raise FrameError(f"{path}: no stars and no images in it: record the topic stars too")
-    answers = night.each(partial(zenith_seen, night.work, mark))
-    assert night.work.instruments.instrument is not None
-    return list(inputs.watched(answers, night.count, lines=False)), night.work.instruments.instrument
-
-
-def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
-    """Adjust the session and print it; returns the exit status."""
-    output, (rows, instrument) = console.Output(args, "deflection"), taken
-    console.complain(unnamed_inclinometer(instrument))
-    for name, answer in rows:
-        if not isinstance(answer, ZenithSighting):
-            console.complain(_why(name, answer))
-    sightings = [answer for _, answer in rows if isinstance(answer, ZenithSighting)]
-    session = checked_session(sightings, instrument, options.atmosphere_of(args), mark)
-    console.complain(*remarks(session, len(rows), instrument.inclinometer.scale))
-    at = {id(s): k for k, s in enumerate(session.sightings)}
-    for name, answer in rows:
-        if isinstance(answer, ZenithSighting):
-            value = frame_json(name, session, at[id(answer)])
-            output.put(value, frame_line(value))
-        else:
-            output.put({"file": name, "status": "left out", "message": _why(name, answer)}, "")
-    without = reduced(session, mark)
-    whole = combined_json(session, without, mark, args.station)
-    output.put(whole, combined_text(session, whole))
-    return console.UNREADABLE if any(isinstance(a, FrameError) for _, a in rows) else 0
+    return lambda work: inputs.watched(night.each(work), night.count, lines=False), night.work
 
 
 def _mark_of(args: argparse.Namespace) -> Place:
@@ -197,7 +173,3 @@ def _mark_of(args: argparse.Namespace) -> Place:
             f"--site {latitude:g} {longitude:g} {height_m:g}: give latitude and longitude in deg and the height in m"
         )
     return Place.on_ellipsoid(latitude, longitude, height_m=height_m)
-
-
-def _why(path: str, answer: Solution | FrameError) -> str:
-    return console.named(path, str(answer) if isinstance(answer, FrameError) else answer.message)

@@ -2,7 +2,6 @@
 """`starpos detect`: the stars of frames."""
 
 import argparse
-from functools import partial
 from typing import TYPE_CHECKING
 
 from starpos.cli import console, inputs
@@ -19,7 +18,7 @@ def run(args: argparse.Namespace) -> int:
     output = console.Output(args, "stars")
     args.frames = inputs.frames_among(args.frames)
     status = 0
-    for path, answer in inputs.worked(args, partial(Reader().on, detected), args.frames):
+    for path, answer in inputs.each_of(args, Reader(), args.frames)(detected):
         if isinstance(answer, FrameError):
             status = console.UNREADABLE
         _tell(path, answer, output)

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from starpos.averaging.average import Average
-from starpos.averaging.poses import MeanAttitude, mean_attitude
+from starpos.averaging.poses import MeanAttitude
 from starpos.averaging.sights import SextantSight
 from starpos.cli import console, options
 from starpos.cli.console import Output
 from starpos.earth.orientation import measured_until, table_age_days
 from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
-from starpos.errors import FixError, StarposError
+from starpos.errors import StarposError
 from starpos.fix.attitude import Attitude
 from starpos.fix.circle import Circle
 from starpos.fix.directions import OPTICAL_AXIS, horizontal
@@ -24,7 +24,7 @@ from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status, status_of
 from starpos.frames.tables import Pointing
 from starpos.night.remarks import Near
-from starpos.night.together import Gathered, Together
+from starpos.night.together import Together
 from starpos.units import utc_text
 
 # numbers of an average that are printed
@@ -142,7 +142,7 @@ def tell_elevations(
     console.complain(whole.why_not, *whole.remarks)
     if whole.average is not None or whole.why_not:
         about_place = about_average(args, whole.average, vertical, near)
-        put_combined(output, None, whole.average, Gathered(), vertical, about_place)
+        put_combined(output, None, whole, vertical, about_place)
     return 0 if whole.average else console.NOTHING
 
 
@@ -157,20 +157,15 @@ def about_average(
 
 
 def put_combined(
-    output: Output,
-    folder: str | None,
-    average: Average | None,
-    gathered: Gathered,
-    vertical: Vertical,
-    about: dict | None = None,
-    mean: MeanAttitude | None = None,
+    output: Output, folder: str | None, together: Together, vertical: Vertical, about: dict | None = None
 ) -> None:
     """Write the average of a night, or that it is missing; about: more keys of JSON.
 
     folder: of the night; None where it is not named.
-    mean: attitude at a known place, which is the answer where no frame has a fix.
     """
+    average, mean, gathered = together.average, together.mean, together.gathered
     rows = gathered.solved or gathered.headings
+    # the mean attitude is the answer where no frame has a fix
     whole = average if gathered.solved or mean is None else mean
     fitted = [f.residual_arcsec for s in rows if (f := s.fix or s.at_place) is not None]
     of_stars = {
@@ -317,15 +312,6 @@ def heading_text_of(found: AttitudeAtPlace | MeanAttitude) -> str:
     )
     heading, on_ground, pitch, roll = (f"{a:.5f} +- {s:.5f}" for a, s in zip(angles, sigma, strict=True))
     return f"heading {heading} (WGS 84: {on_ground}) deg, pitch {pitch}, roll {roll}"
-
-
-def mean_of(answers: Sequence[Solution]) -> tuple[MeanAttitude | None, str]:
-    """The mean attitude of the frames, or None with the reason, which is empty if no frame has an attitude."""
-    attitudes = [s.at_place for s in answers if s.at_place]
-    try:
-        return (mean_attitude(attitudes) if attitudes else None), ""
-    except FixError as error:
-        return None, str(error)
 
 
 def _with_variance(covariance: np.ndarray | None, heading: float) -> np.ndarray:

@@ -3,7 +3,6 @@
 
 import argparse
 import math
-from functools import partial
 
 import numpy as np
 
@@ -22,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     complaints = console.FrameComplaints()
     read, output = inputs.reader_of(args), console.Output(args, "field")
     solving = inputs.identifying(args, args.frames, read, args.search_time)
-    for path, answer in inputs.worked(args, partial(read.on, solving), args.frames):
+    for path, answer in inputs.each_of(args, read, args.frames)(solving):
         if isinstance(answer, FrameError):
             unreadable, found, cpu_ms = True, Solution.unreadable(path, answer), 0.0
         else:

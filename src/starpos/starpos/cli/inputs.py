@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,11 +16,10 @@ from typing import TYPE_CHECKING, Any
 from starpos.cli import console, options
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
-from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
+from starpos.errors import FrameError, InstrumentError, StarposError, TiltError, named
 from starpos.fix.blind import BlindSolver
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.searching import Sight
-from starpos.fix.solver import Solver
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame, Stars, no_stars
 from starpos.frames.reading import are_photographs, read_frame, why_no_time
@@ -27,9 +27,9 @@ from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.instrument import ByGravity, Instrument
 from starpos.night.opening import frames_in, work_of
-from starpos.night.reading import Instruments, Reader, TiltFile
+from starpos.night.reading import Each, Instruments, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
-from starpos.night.work import Solving
+from starpos.night.work import Solving, prepare
 from starpos.parallel.processes import DoCalls, memory_bytes, processors, workers
 from starpos.sky import catalogue
 
@@ -107,7 +107,7 @@ def seen_at(args: argparse.Namespace, place: Place) -> Iterator[FrameAtPlace]:
         if at_place is None or answer.found is None:
             timed = answer.found is None or item.mid_unix_s
             no_time = f"{item.place}: no time of exposure: {why_no_time(item)}"
-            console.complain(console.named(item.place, answer.message) if timed else no_time)
+            console.complain(named(item.place, answer.message) if timed else no_time)
             continue
         instrument = sight.instrument or work.instruments.of(item)
         assert instrument is not None
@@ -124,7 +124,7 @@ def identifying(args: argparse.Namespace, frames: Sequence[str], read: Reader, s
     if about is not None:
         if about.focal_px is not None or not is_untold(args):
             given = given_of(args, about)
-        prepare(given, about)
+        console.complain(prepare(given, about, console.ProgressBar()))
     # without a frame that can be read, each one reports why it cannot
     return Solving(given, search_s=search_s, progress=console.ProgressBar())
 
@@ -269,6 +269,11 @@ def worked(
         yield from zip(paths, answers, strict=True)
 
 
+def each_of(args: argparse.Namespace, read: Reader, paths: Sequence[str], lines: bool = True) -> Each:
+    """Go through frames by the workers of --jobs, as `worked`."""
+    return lambda work: worked(args, partial(read.on, work), paths, lines=lines)
+
+
 def watched(answers: Iterable, number: int, what: str = "frame", lines: bool = True) -> Iterator:
     """The answers unchanged, with a progress bar unless their lines on standard output show it on the same terminal."""
     bar = console.ProgressBar()
@@ -276,16 +281,3 @@ def watched(answers: Iterable, number: int, what: str = "frame", lines: bool = T
         if not (lines and sys.stdout.isatty()):
             bar(f"{what} {k} of {number}", k / number)
         yield answer
-
-
-def prepare(given: Instruments, about: Stars) -> None:
-    """Put the tables of a field, or of any, into the cache, for all processes; reports what the catalogue lacks."""
-    stars, bar = catalogue.load_catalogue(), console.ProgressBar()
-    if given.instrument is None or given.sought:
-        BlindSolver(stars, bar).prepare()
-        return
-    solver = Solver(given.instrument, stars, progress=bar)
-    # the frames report the error
-    with suppress(StarposError):
-        if thin := solver.prepare(about.width, about.height, about.origin_px):
-            console.complain(thin)

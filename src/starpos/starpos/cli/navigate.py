@@ -3,8 +3,6 @@
 
 import argparse
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,8 +11,6 @@ from starpos.cli import console, inputs, options
 from starpos.cli.fix_output import FIX_KEYS
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Geodetic, Vertical
-from starpos.errors import VoyageError
-from starpos.instrument.instrument import framed
 from starpos.navigation.estimate import VoyageFix
 from starpos.navigation.voyage import Voyage
 from starpos.night import under_way
@@ -35,27 +31,22 @@ KEYS: dict[str, Callable[[Any, Geodetic], Any]] = {
 def run(args: argparse.Namespace) -> int:
     args.frames = inputs.frames_among(args.frames, args.imu, args.velocity)
     vertical, read = options.vertical_of(args), inputs.reader_of(args)
-    about = read.first(args.frames)
-    if about is None:
-        raise VoyageError(f"none of the {len(args.frames)} frames can be read: give star lists or frames")
-    instrument, doubt = framed(options.instrument_of(args, about), about, under_way.MOUNT)
-    vessel = under_way.vessel_of(
-        instrument,
+    about = under_way.first_of(read, args.frames)
+    frames, voyage = under_way.voyage_of(
+        about,
+        inputs.each_of(args, read, args.frames),
+        inputs.given_of(args, about),
+        args.imu,
+        args.velocity,
         options.atmosphere_of(args),
-        doubt,
+        console.complain,
+        console.ProgressBar(),
         mount_stddev_deg=args.mount_stddev,
         height_m=args.altitude_m,
         imu_model=args.imu_model,
         vehicle=args.vehicle,
         drift_stddev=args.drift_stddev,
     )
-    console.complain(doubt)
-    given = replace(inputs.given_of(args, about), instrument=instrument)
-    inputs.prepare(given, about)
-    work = partial(read.on, partial(under_way.voyage_frame, given))
-    frames = under_way.voyage_frames(answer for _, answer in inputs.worked(args, work, args.frames))
-    console.complain(*(frame.message for frame in frames))
-    voyage = under_way.voyage_of(frames, args.imu, args.velocity, vessel, console.ProgressBar())
     return tell(args, frames, voyage, vertical)
 
 

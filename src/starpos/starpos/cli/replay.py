@@ -6,9 +6,6 @@ import argparse
 from starpos.cli import console, fix_output, inputs
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError
-from starpos.fix.checks import BY_PARAMETERS, MODEL_BY_PARAMETERS, unknown_a3, unnamed_inclinometer
-from starpos.night.remarks import of_extrapolation
-from starpos.night.together import FrameAnswer, Gathered
 from starpos.recording.drivers import Drivers
 from starpos.recording.topics import remaps_of
 from starpos.session.replay import PlayedNight, Playing
@@ -38,9 +35,7 @@ def tell(
         console.complain(night)
         return console.UNREADABLE
     console.complain_of(bag, *night.said)
-    gathered = Gathered()
     for solution in night.solutions:
-        gathered.gather(FrameAnswer(bag, solution))
         if not solution.fix:
             console.complain(f"{bag}: {solution.message}")
         time = "a frame" if solution.utc_unix_s is None else utc_text(solution.utc_unix_s)
@@ -48,16 +43,10 @@ def tell(
             {"file": bag} | fix_output.json_of(solution.fix, vertical) | fix_output.json_about(solution),
             fix_output.line_of(f"{bag} {time}", solution, turning=False),
         )
-    whole, solved = night.average, gathered.solved
-    remarks = [of_extrapolation(solved)]
-    if solved:
-        remarks.append(unnamed_inclinometer(night.instrument, MODEL_BY_PARAMETERS))
-    if whole:
-        calibration = night.instrument.calibration
-        remarks.append(unknown_a3(calibration, whole.covariance, whole.terms, BY_PARAMETERS))
-    console.complain_of(bag, *remarks)
-    if solved:
-        fix_output.put_combined(output, bag if len(args.bags) > 1 else None, whole, gathered, vertical)
+    whole = night.together
+    console.complain_of(bag, *whole.remarks)
+    if whole.gathered.solved:
+        fix_output.put_combined(output, bag if len(args.bags) > 1 else None, whole, vertical)
     if (by_satellites := night.by_satellites) is not None:
         from starpos.cli.satellites import fix_json
 
@@ -65,4 +54,4 @@ def tell(
         output.put(value, f"by satellites: {by_satellites.text}", rows=())
     # a trouble names its bag
     console.complain(night.trouble or f"{bag}: {night.summary}")
-    return console.UNREADABLE if night.trouble else 0 if solved else console.NOTHING
+    return console.UNREADABLE if night.trouble else 0 if whole.gathered.solved else console.NOTHING

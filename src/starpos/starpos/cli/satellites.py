@@ -2,43 +2,26 @@
 """`starpos satellites`: a place from satellites among the stars, without a level, and which hour shows most of them."""
 
 import argparse
-import json
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
 from starpos.cli import console, inputs, options
 from starpos.earth.place import Place
-from starpos.earth.refraction import Atmosphere
-from starpos.earth.vertical import Deflection
-from starpos.errors import FrameError, SatelliteError, StarposError
-from starpos.files import read_regular
+from starpos.errors import SatelliteError
 from starpos.fix.blind import SEARCH_S
-from starpos.fix.searching import Sight
-from starpos.fix.solution import Solution
-from starpos.fix.solver import Solver
-from starpos.gnss.receiver import gnss_place, read_gnss_csv
-from starpos.night.work import trails_seen
-from starpos.satellites.adjustment import KnownBefore
-from starpos.satellites.elements import Orbit, chosen, read_orbits
-from starpos.satellites.locating import SatelliteFix, locate
+from starpos.night.by_satellites import located, orbits_at, sighted
+from starpos.night.reading import Each
+from starpos.night.work import Solving
+from starpos.satellites.elements import Orbit
+from starpos.satellites.locating import SatelliteFix
 from starpos.satellites.planning import HourOfSatellites, nights_hours
-from starpos.satellites.sightings import read_iod, read_sightings
 from starpos.satellites.trails import SatelliteTrail
-from starpos.sky import catalogue
 from starpos.units import unix_of, utc_text
 
-# of a height that is stated without an error
-HEIGHT_STDDEV_M = 50.0
 KM = 1000.0
-# other files are frames
-TABLES = ".csv", ".iod", ".txt"
-MOST_JSON_BYTES = 300_000_000
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,23 +29,29 @@ def run(args: argparse.Namespace) -> int:
         return plan(args)
     if not args.sightings or not args.elements:
         raise SatelliteError("give frames or sightings and --elements, or --plan LAT LON")
-    frames = [path for path in args.sightings if Path(path).suffix.lower() not in TABLES]
-    trails = [trail for path in args.sightings if path not in frames for trail in _read(path)]
-    sights = _look(args, frames, trails) if frames else {}
-    if not trails:
-        return _refused(args, f"none of {len(frames)} frames shows an end of a trail: give more frames")
-    begin = float(min(t.utc_unix_s.min() for t in trails))
-    usable, about = chosen(_orbits(args.elements), begin, newer=args.newer_elements)
-    console.complain(*about)
-    prior = _prior(args, begin)
-    try:
-        fix = locate(trails, usable, prior)
-    except SatelliteError as e:
-        return _refused(args, str(e))
+    complaints = console.FrameComplaints()
+    trails, sights = sighted(args.sightings, partial(_look, args), console.complain, complaints)
+    complaints.end()
+    fix = located(
+        trails,
+        sights,
+        args.elements,
+        height_m=args.height,
+        height_stddev_m=args.height_stddev,
+        clock_stddev_s=args.clock_stddev,
+        near=_near(args),
+        newer_elements=args.newer_elements,
+        say=console.complain,
+    )
+    if isinstance(fix, str):
+        return _refused(args, fix)
     for k, trail in enumerate(trails):
         value = trail_json(trail, fix, k)
         console.tell(args, value, trail_line(value))
-    headings = [h for name, sight in sights.items() if (h := heading_json(name, sight, fix)) is not None]
+    headings = [
+        {"file": name, "heading": np.degrees(heading), "sigma_heading_deg": np.degrees(sigma)}
+        for name, heading, sigma in fix.headings
+    ]
     lines = [f"{h['file']}: heading {h['heading']:.4f} +- {h['sigma_heading_deg']:.4f} deg" for h in headings]
     console.tell(
         args, {"combined": True} | fix_json(fix) | {"frames": headings}, "\n".join([*lines, fix.text])
@@ -79,80 +68,19 @@ def _refused(args: argparse.Namespace, why: str) -> int:
     return 1
 
 
-def _orbits(paths: Sequence[str]) -> list[Orbit]:
-    orbits = []
-    for path in paths:
-        found, about = read_orbits(path)
-        orbits += found
-        console.complain(*about)
-    return orbits
+def _look(args: argparse.Namespace, frames: list[str]) -> tuple[Solving, Each]:
+    read = inputs.reader_of(args)
+    return inputs.identifying(args, frames, read, SEARCH_S), inputs.each_of(args, read, frames)
 
 
-def _read(path: str) -> list[SatelliteTrail]:
-    if Path(path).suffix.lower() == ".csv":
-        return read_sightings(path)
-    trails, about = read_iod(path)
-    console.complain(*about)
-    return trails
-
-
-def _look(args: argparse.Namespace, frames: list[str], trails: list[SatelliteTrail]) -> dict[str, Sight]:
-    """The frames that were identified, by name; their trails are added, numbered on, and what is left out is said."""
-    number, sights = 1 + max((trail.track for trail in trails), default=-1), {}
-    complaints, read = console.FrameComplaints(), inputs.reader_of(args)
-    work = partial(read.on, partial(trails_seen, inputs.identifying(args, frames, read, SEARCH_S)))
-    for path, answer in inputs.worked(args, work, frames):
-        if isinstance(answer, FrameError):
-            complaints(path, str(answer))
-        elif isinstance(answer, Solution):
-            complaints(path, answer.message)
-        else:
-            sights[path], found, left_out = answer
-            if left_out:
-                complaints(path, left_out)
-            trails += [replace(t, track=number + k, file=path) for k, t in enumerate(found)]
-            number += len(found)
-    complaints.end()
-    return sights
-
-
-def _prior(args: argparse.Namespace, utc_unix_s: float) -> KnownBefore:
-    height = math.nan if args.height is None else args.height
-    prior = KnownBefore.at_height(height, HEIGHT_STDDEV_M, args.clock_stddev)
-    if args.height_stddev is not None:
-        prior = prior._replace(height_stddev_m=args.height_stddev)
-    if args.near is not None:
-        latitude, longitude, km = args.near
-        if not (abs(latitude) <= 90 and abs(longitude) <= 360 and 0 < km < 20_000):
-            raise SatelliteError("--near takes a latitude, a longitude (deg) and an error in km")
-        near = Place.on_ellipsoid(latitude, longitude, covariance=(km * KM) ** 2 * np.eye(2))
-        return prior._replace(near=near)
-    return prior if args.join is None else prior._replace(near=_joined(args.join, utc_unix_s))
-
-
-def _joined(path: str, utc_unix_s: float) -> Place:
-    """The place of what `starpos solve --json` printed, or of GNSS."""
-    if Path(path).suffix.lower() == ".csv":
-        track, faults = read_gnss_csv(path)
-        console.complain(*faults)
-        if (place := track.at(utc_unix_s)) is None:
-            raise SatelliteError(f"{path}: no GNSS place at {utc_text(utc_unix_s)}, of the first trail")
-        return place
-    try:
-        text = read_regular(path, MOST_JSON_BYTES).decode()
-        rows = [json.loads(line) for line in text.splitlines() if line.startswith("{")]
-        row = next(
-            row for row in reversed(rows) if row.get("combined") and row.get("latitude_geodetic") is not None
-        )
-        covariance = np.array(row["covariance_geodetic"], float)[:2, :2]
-        latitude, longitude = float(row["latitude_geodetic"]), float(row["longitude_geodetic"])
-    except (OSError, ValueError, KeyError, StopIteration, TypeError, IndexError):
-        raise SatelliteError(
-            f"{path}: no place in it: give what `starpos solve --json` printed, or a receiver's CSV as solve --gnss"
-        ) from None
-    if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
-        raise SatelliteError(f"{path}: the covariance of its place is impossible")
-    return Place.on_ellipsoid(latitude, longitude, covariance=covariance)
+def _near(args: argparse.Namespace) -> Place | str | None:
+    """The place of --near, or the file of --join; None without either."""
+    if args.near is None:
+        return args.join
+    latitude, longitude, km = args.near
+    if not (abs(latitude) <= 90 and abs(longitude) <= 360 and 0 < km < 20_000):
+        raise SatelliteError("--near takes a latitude, a longitude (deg) and an error in km")
+    return Place.on_ellipsoid(latitude, longitude, covariance=(km * KM) ** 2 * np.eye(2))
 
 
 def trail_json(trail: SatelliteTrail, fix: SatelliteFix, k: int) -> dict:
@@ -183,21 +111,6 @@ def trail_line(value: dict) -> str:
     return f"{head}: {value['along_km']:+.2f} km along, {value['across_km']:+.2f} km across"
 
 
-def heading_json(name: str, sight: Sight, fix: SatelliteFix) -> dict | None:
-    """Where a frame's camera looks from that place, from geodetic north; None where that is not known."""
-    if sight.instrument is None or sight.found is None or sight.stars.mid_unix_s is None:
-        return None
-    place = gnss_place(sight.stars.mid_unix_s, fix.latitude, fix.longitude, fix.covariance[:2, :2])
-    solver = Solver(sight.instrument, catalogue.load_catalogue(), Atmosphere.measured(None, None))
-    try:
-        link = solver.attitude_at(sight.stars, sight.found, place.deflected(Deflection())).ellipsoid
-    except StarposError as e:
-        console.complain(f"{name}: no heading: {e}")
-        return None
-    sigma = np.degrees(np.sqrt(link.angles_covariance[0, 0]))
-    return {"file": name, "heading": np.degrees(link.heading), "sigma_heading_deg": sigma}
-
-
 def fix_json(fix: SatelliteFix) -> dict:
     """The place for --json."""
     a = fix.adjustment
@@ -223,8 +136,7 @@ def plan(args: argparse.Namespace) -> int:
     begin = time.time() if args.at is None else unix_of(args.at)
     orbits: list[Orbit] = []
     if args.elements:
-        orbits, about = chosen(_orbits(args.elements), begin, newer=args.newer_elements)
-        console.complain(*about)
+        orbits = orbits_at(begin, args.elements, args.newer_elements, console.complain)
     lens = None
     if args.size is not None:
         focal_px = options.instrument_of(args, None).focal_px

@@ -3,7 +3,7 @@
 
 import argparse
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,15 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starpos.averaging.elevation_axis import FoundAxis
-from starpos.averaging.sights import circle_of_sight, place_of_sights, read_sights
+from starpos.averaging.sights import read_sights
 from starpos.calibration.misalignment import Calibrated
 from starpos.cli import console, fix_output, inputs, options, overwriting, places_file
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import InstrumentError, StarposError, TiltError
-from starpos.fix.checks import unnamed_inclinometer
-from starpos.fix.circle import Circle
-from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.frames.reading import are_photographs
@@ -33,16 +30,9 @@ from starpos.night import field
 from starpos.night.opening import work_of
 from starpos.night.reading import NO_CAMERA, Instruments
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, worth_saving
-from starpos.night.solving import How, NightAnswers, answers_of
-from starpos.night.together import (
-    FrameAnswer,
-    Gathered,
-    Together,
-    from_elevations,
-    together,
-    turned,
-)
-from starpos.night.work import Solving
+from starpos.night.solving import How, NightAnswers, answers_of, answers_of_pointings
+from starpos.night.together import FrameAnswer, from_elevations, from_sights
+from starpos.night.work import Solving, prepare
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
@@ -57,24 +47,21 @@ def tell(
     answers: NightAnswers,
     vertical: Vertical,
     place: Place | None = None,
-    work: Solving | None = None,
 ) -> int:
     """Write the answer to each frame of a night, and what they come to together; returns the exit status.
 
     folder: of the night; None where it is not named.
     place: the known place, whose headings are then reported; None without one.
-    work: on the frames, which may say which focal length fits those that were not identified.
     """
     statuses = []
     if answers.turned is not None:
         statuses.append(tell_turned(args, folder, answers.turned, answers.remarks))
-    watched, gathered, complaints = answers.watched, Gathered(), console.FrameComplaints()
-    if watched is not None:
+    if answers.watched is not None:
         console.complain_of(folder, *answers.remarks)
         if args.learned is not None:
-            _save_learned(Path(args.learned), watched.learned)
-    for answer in answers.each:
-        gathered.gather(answer)
+            _save_learned(Path(args.learned), answers.watched.learned)
+    complaints, near = console.FrameComplaints(), inputs.near_of(args)
+    for answer in answers:
         s = answer.solution
         if s.fix is None and s.circle is None and (s.at_place is None or not s.ok):
             complaints(answer.name, s.message)
@@ -82,28 +69,21 @@ def tell(
             complaints(answer.name, s.remark)
         output.put(_json_of_answer(args, answer, vertical, place), _line_of_answer(args, answer, place))
     complaints.end()
-    fixes, headings, near = gathered.fixes, gathered.headings, inputs.near_of(args)
-    whole = together(gathered, answers.given, near)
-    mean, why = (None, "") if place is None else fix_output.mean_of(headings)
-    unnamed = ""
-    if fixes and watched is not None and answers.instrument is not None:
-        unnamed = unnamed_inclinometer(answers.instrument)
-    console.complain_of(folder, whole.why_not, unnamed, *whole.remarks, why)
-    where = whole.average or (fixes[-1] if fixes else None)
-    about = fix_output.about_average(args, where, vertical, near)
+    whole = answers.together(near)
+    headings = whole.gathered.headings
+    console.complain_of(folder, whole.why_not, *whole.remarks)
+    about = fix_output.about_average(args, whole.where, vertical, near)
     if place is not None:
-        about |= fix_output.with_heading(
-            fix_output.json_of(whole.average, vertical), mean, place, options.axes_of(args)
-        )
-    if where is not None or (headings and place is not None):
-        fix_output.put_combined(output, folder, whole.average, gathered, vertical, about, mean)
-    elif gathered.lost is not None and not headings and work is not None:
-        console.complain_of(folder, work.fitting(gathered.lost))
+        average = fix_output.json_of(whole.average, vertical)
+        about |= fix_output.with_heading(average, whole.mean, place, options.axes_of(args))
+    if whole.where is not None or (headings and place is not None):
+        fix_output.put_combined(output, folder, whole, vertical, about)
     # without tilts headings are all that was asked for, and by day they are all there is
     by_day = any(s.bodies for s in headings)
     found = bool(headings) if place is not None and (by_day or not args.tilt) else whole.average is not None
     found |= args.gnss is not None and args.tilt is None and bool(headings)
-    return max([*statuses, console.UNREADABLE if gathered.unreadable else 0 if found else console.NOTHING])
+    status = 0 if found else console.NOTHING
+    return max([*statuses, console.UNREADABLE if whole.gathered.unreadable else status])
 
 
 def _json_of_answer(
@@ -201,21 +181,12 @@ def run_pointings(args: argparse.Namespace) -> int:
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
     check_save(args, solver.instrument)
     tilts = NO_TILTS if own_level else inputs.checked_tilts(args.tilt, solver.instrument)
-    whole = [p for p in pointings if p.has_roll]
-    output = console.Output(args, "fix" if whole else "elevations")
-    if not whole:
+    with_roll = any(p.has_roll for p in pointings)
+    output = console.Output(args, "fix" if with_roll else "elevations")
+    if not with_roll:
         return _from_elevations(args, output, solver, tilts, pointings, vertical, near)
-    found: Calibrated | None = None
-    said: tuple[str, ...] = ()
-    given = solver.instrument if not args.self_calibrate else None
-    solutions: Iterable[Solution] = (solver.solve_pointing(p, tilts) for p in pointings)
-    if args.self_calibrate:
-        found, said = turned(solver, whole, tilts, options.turn_of(args))
-        solved = iter(found.solutions)
-        solutions = [next(solved) if p.has_roll else solver.solve_pointing(p) for p in pointings]
-    each = (FrameAnswer(p.source, s) for p, s in zip(pointings, solutions, strict=True))
-    answers = NightAnswers(each=each, given=given, turned=found, remarks=said)
-    return tell(args, output, None, answers, vertical)
+    turn_deg = options.turn_of(args) if args.self_calibrate else None
+    return tell(args, output, None, answers_of_pointings(solver, pointings, tilts, turn_deg), vertical)
 
 
 def _from_elevations(
@@ -259,21 +230,7 @@ def _run_sights(args: argparse.Namespace) -> int:
     air = options.atmosphere_of(args)
     ephemeris = options.ephemeris_of(args)
     output = console.Output(args, "elevations")
-    circles: list[Circle | StarposError] = []
-    for sight in sights:
-        try:
-            circles.append(circle_of_sight(sight, catalogue.load_catalogue(), air, clock_s, ephemeris))
-        except StarposError as error:
-            circles.append(error)
-    whole = Together()
-    sound = [(s, c) for s, c in zip(sights, circles, strict=True) if isinstance(c, Circle)]
-    if sound:
-        try:
-            used, seen = zip(*sound, strict=True)
-            place = place_of_sights(used, seen, None if near is None else near.place)
-            whole = Together.by_circles(place, near)
-        except StarposError as error:
-            whole = Together(None, str(error))
+    circles, whole = from_sights(sights, air, clock_s, near, ephemeris)
     return fix_output.tell_elevations(args, output, sights, circles, whole, vertical, near)
 
 
@@ -343,7 +300,7 @@ def _run(args: argparse.Namespace) -> int:
             # takes the answers of this night, and leaves the rest
             rows = zip(night.frames, sights, strict=False)
             answers = answers_of(rows, work, vertical, how, console.ProgressBar())
-            statuses.append(tell(args, output, night.folder, answers, vertical, place, work))
+            statuses.append(tell(args, output, night.folder, answers, vertical, place))
     if args.out is not None:
         places_file.write(args.out, output.answers)
     return max(statuses)
@@ -375,5 +332,5 @@ def _work(
     assert work.instruments.instrument is not None
     if not work.instruments.sought:
         check_save(args, work.instruments.instrument)
-    inputs.prepare(work.instruments, about)
+    console.complain(prepare(work.instruments, about, console.ProgressBar()))
     return replace(work, tilts=NO_TILTS) if own_level else work

@@ -7,20 +7,24 @@ from pathlib import Path
 
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FrameError, StarposError
+from starpos.errors import FrameError, StarposError, named
+from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver, check_explained
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos.night.opening import work_of
-from starpos.night.reading import Instruments, Reader
+from starpos.night.reading import Each, Instruments, Reader
 from starpos.night.work import Solving
-from starpos.parallel.processes import in_turn
+from starpos.progress import Say, quiet
 from starpos.sky import catalogue
 from starpos.zenith.adjustment import DeflectionSession
-from starpos.zenith.doubts import checked_session
+from starpos.zenith.doubts import checked_session, remarks
 from starpos.zenith.sighting import ZenithSighting, sighting
+
+# names of frames, and their sightings or what is wrong with them
+Sightings = list[tuple[str, ZenithSighting | Solution | FrameError]]
 
 
 def zenith_seen(given: Solving, mark: Place, item: Frame | Stars) -> ZenithSighting | Solution:
@@ -39,6 +43,29 @@ def zenith_seen(given: Solving, mark: Place, item: Frame | Stars) -> ZenithSight
         return sighting(solver, sight.stars, sight.found, mark, given.tilts)
     except StarposError as error:
         return Solution.refused(sight.stars, error)
+
+
+def why_none(name: str, answer: Solution | FrameError) -> str:
+    """A sentence on a frame that has no sighting."""
+    return named(name, answer if isinstance(answer, FrameError) else answer.message)
+
+
+def session_of(
+    each: Each, given: Solving, mark: Place, say: Say = quiet
+) -> tuple[DeflectionSession, Sightings]:
+    """The session of the frames through which `each` goes, by the instruments, tilts and air given.
+
+    say: takes what looks wrong.  FixError if the sightings do not bear a deflection.
+    """
+    instrument = given.instruments.instrument
+    assert instrument is not None
+    rows: Sightings = list(each(partial(zenith_seen, given, mark)))
+    say(unnamed_inclinometer(instrument))
+    say(*(why_none(name, answer) for name, answer in rows if not isinstance(answer, ZenithSighting)))
+    sightings = [answer for _, answer in rows if isinstance(answer, ZenithSighting)]
+    session = checked_session(sightings, instrument, given.atmosphere, mark)
+    say(*remarks(session, len(rows), instrument.inclinometer.scale))
+    return session, rows
 
 
 def deflection(
@@ -77,15 +104,8 @@ def deflection(
     (30, -12)
     """
     known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
-    air = Atmosphere.measured(None, None) if atmosphere is None else atmosphere
-    read, paths = Reader(), tuple(map(str, frames))
-    first = read.first(paths)
-    if first is None:
-        raise FrameError(f"none of the {len(paths)} frames can be read: give frames or lists of stars")
-    given, _ = work_of(Instruments(known), first, Path(tilt), air)
-    assert given.instruments.instrument is not None
+    read, paths, air = Reader(), tuple(map(str, frames)), atmosphere or Atmosphere.measured(None, None)
+    given, _ = work_of(Instruments(known), read.one_of(paths), Path(tilt), air)
     mark = Place.on_ellipsoid(site[0], site[1], height_m=site[2])
-    work = partial(read.on, partial(zenith_seen, given, mark))
-    answers = in_turn((work, path) for path in paths)
-    sightings = [answer for answer in answers if isinstance(answer, ZenithSighting)]
-    return checked_session(sightings, given.instruments.instrument, air, mark)
+    session, _ = session_of(read.each(paths), given, mark)
+    return session

@@ -19,8 +19,8 @@ from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.messages.tilt import UNUSABLE, message_to_tilt
 from starpos.night.opening import truth_in
-from starpos.night.reading import Instruments
-from starpos.night.solving import Exposures, Worked
+from starpos.night.reading import Instruments, Worked
+from starpos.night.solving import Exposures
 from starpos.night.work import Solving
 from starpos.progress import Progress
 from starpos.recording.bag import BagReader

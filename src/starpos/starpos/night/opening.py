@@ -3,11 +3,10 @@
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from starpos.earth.vertical import Deflection, Vertical
 from starpos.errors import FrameError, TiltError
 from starpos.files import open_regular, read_regular
 from starpos.frames.exif import CameraClock
-from starpos.frames.frame import Frame, Stars
+from starpos.frames.frame import Stars
 from starpos.frames.gravity import PHONE
 from starpos.frames.reading import FITS, HEIF, JPEG, PICTURE, RAW, are_photographs
 from starpos.frames.tables import GNSS, SIMULATED, TILTS, TRUTH
@@ -28,9 +27,8 @@ from starpos.instrument.tilt_log import Tilts, TiltsByTime
 from starpos.night.night import Night, Truth
 from starpos.night.reading import Instruments, Reader, TiltFile
 from starpos.night.remarks import of_gravity, of_tilts
-from starpos.night.solving import Exposures, How, Worked, solved_night
+from starpos.night.solving import Exposures, How, solved_night
 from starpos.night.work import Solving
-from starpos.parallel.processes import in_turn
 from starpos.progress import Progress, quiet
 
 if TYPE_CHECKING:
@@ -75,16 +73,12 @@ def exposures(
             work, remarks = work_of(given, first, None, atmosphere, place)
             work = replace(work, tilts=TiltsByTime(why=str(error)))
 
-    def each(work: Callable[[Frame | Stars], Any]) -> Worked:
-        answers = in_turn((partial(read.on, work), str(path)) for path in frames)
-        return zip((path.name for path in frames), answers, strict=True)
-
     kind = "lists of stars" if frames[0].suffix == ".csv" else "frames"
     return Exposures(
         name=frames[0].name if len(frames) == 1 else folder.resolve().name or str(folder),
         origin=f"solved from {len(frames)} {kind} and {'the gravity in their files' if by_gravity else TILTS}",
         count=len(frames),
-        each=each,
+        each=lambda work: ((Path(path).name, a) for path, a in read.each([*map(str, frames)])(work)),
         work=work,
         vertical=vertical,
         truth=truth_in(folder),

@@ -3,10 +3,10 @@
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,12 @@ from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument, with_frame_size
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
+from starpos.parallel.processes import in_turn
+
+# the names of frames, and what a work made of each, or why it cannot be read
+Worked = Iterator[tuple[str, Any]]
+# goes through all frames with a work
+Each = Callable[[Callable[[Frame | Stars], Any]], Worked]
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,10 @@ class Reader:
     def on(self, work: Callable[[Frame | Stars], Any], path: str) -> Any:
         """What a work makes of the frame or list in a file."""
         return work(self(path))
+
+    def each(self, paths: Sequence[str]) -> Each:
+        """Go through files, one after the other."""
+        return lambda work: zip(paths, in_turn((partial(self.on, work), p) for p in paths), strict=True)
 
     def __reduce__(self) -> tuple[type["Reader"], tuple[CameraClock | None, tuple[float, float]]]:
         return Reader, (self.clock, self.delay_s)

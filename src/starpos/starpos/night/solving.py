@@ -5,30 +5,34 @@ Frames are solved one by one, or all together: by turning, or compared with GNSS
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starpos.averaging.poses import mean_attitude
 from starpos.calibration.misalignment import Calibrated
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
-from starpos.errors import FrameError, GnssError
+from starpos.errors import FixError, FrameError, GnssError
 from starpos.fix.attitude import heading_of
 from starpos.fix.budget import local_north
+from starpos.fix.checks import unnamed_inclinometer
 from starpos.fix.fix import Fix
 from starpos.fix.glows import Glow
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver, placed
-from starpos.frames.frame import Frame, Stars
+from starpos.frames.tables import Pointing
 from starpos.identification.prior import Hint
 from starpos.instrument.inclinometer import level_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night.night import Night, Shot, Truth, WatchedNight, why_none
-from starpos.night.together import FrameAnswer, Gathered, together, turned
+from starpos.night.reading import Each
+from starpos.night.remarks import Near
+from starpos.night.together import FrameAnswer, Gathered, Together, together, turned
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
 from starpos.rotation import half_turns, normalised
@@ -40,9 +44,6 @@ if TYPE_CHECKING:
 
 # if readings are further from their median than this, the camera was moved
 STILL_SIGMA = 8.0
-
-# the names of frames, and what a work made of each, or why it cannot be read
-Worked = Iterator[tuple[str, Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +57,7 @@ class Exposures:
     name: str
     origin: str
     count: int
-    each: Callable[[Callable[[Frame | Stars], Any]], Worked]
+    each: Each
     work: Solving
     vertical: Vertical
     truth: Truth | None = None
@@ -90,19 +91,44 @@ ONE_BY_ONE = How()
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class NightAnswers:
-    """The answers of a night; each: one for each frame, in order, as soon as it is there.
+    """The answers of a night: one for each frame, in order, as soon as it is there; then what they come to `together`.
 
+    work: that was asked for; None for pointings.
     instrument: on which they rest; None without a frame.
     given: the instrument whose A3 was used unchanged; None where it was found, or taught by GNSS.
     turned: A3 found by turning.  remarks: on what was found or taught.
     """
 
     each: Iterable[FrameAnswer]
+    work: Solving | None = None
     instrument: Instrument | None = None
     given: Instrument | None = None
     turned: Calibrated | None = None
     watched: WatchedNight | None = None
     remarks: tuple[str, ...] = ()
+    _gathered: Gathered = field(default_factory=Gathered)
+
+    def __iter__(self) -> Iterator[FrameAnswer]:
+        for answer in self.each:
+            self._gathered.gather(answer)
+            yield answer
+
+    def together(self, near: Near | None = None) -> Together:
+        """What the answers come to, after the last one; near: where the instrument should be."""
+        gathered = self._gathered
+        whole, mean = together(gathered, self.given, near), None
+        said = list(whole.remarks)
+        if gathered.fixes and self.watched is not None and self.instrument is not None:
+            said.insert(0, unnamed_inclinometer(self.instrument))
+        if gathered.headings and self.work is not None and self.work.places is not None:
+            try:
+                mean = mean_attitude([s.at_place for s in gathered.headings if s.at_place])
+            except FixError as error:
+                said.append(str(error))
+        whole = replace(whole, mean=mean, gathered=gathered)
+        if gathered.lost is not None and not (whole.where or gathered.headings) and self.work is not None:
+            said.append(self.work.fitting(gathered.lost))
+        return replace(whole, remarks=tuple(filter(None, said)))
 
 
 def answers_of(
@@ -115,22 +141,42 @@ def answers_of(
     """Answer the frames of a night, by name; sights: what `how.work(asked)` gave of each."""
     if how.one_by_one:
         known = asked.instruments.instrument
-        return NightAnswers(each=_without_lamps(_one_by_one(sights, asked)), instrument=known, given=known)
+        each = _without_lamps(_one_by_one(sights, asked))
+        return NightAnswers(each=each, work=asked, instrument=known, given=known)
     rows = list(sights)
     seen = [sight for _, sight in rows if isinstance(sight, Sight)]
     if not seen:
-        return NightAnswers(each=_in_order(rows, ()))
+        return NightAnswers(each=_in_order(rows, ()), work=asked)
     first = next((s for s in seen if asked.instruments.of(s.stars) is not None), seen[0])
     solver = replace(asked.solver(first.stars), progress=progress)
     solver, alike = of_one_camera(solver, seen)
     if how.gnss is not None:
         watched = _watched_night(solver, alike, asked.tilts, how.gnss, how.learned, vertical)
-        each = _in_order(rows, ((a.solution, a) for a in watched.answers))
-        return NightAnswers(each=each, instrument=solver.instrument, watched=watched, remarks=watched.remarks)
+        return NightAnswers(
+            each=_in_order(rows, ((a.solution, a) for a in watched.answers)),
+            work=asked,
+            instrument=solver.instrument,
+            watched=watched,
+            remarks=watched.remarks,
+        )
     assert how.turn_stddev_deg is not None
     found, said = turned(solver, alike, asked.tilts or NO_TILTS, how.turn_stddev_deg)
     each = _in_order(rows, ((s, None) for s in found.solutions))
-    return NightAnswers(each=each, instrument=found.instrument, turned=found, remarks=said)
+    return NightAnswers(each=each, work=asked, instrument=found.instrument, turned=found, remarks=said)
+
+
+def answers_of_pointings(
+    solver: Solver, pointings: Sequence[Pointing], tilts: Tilts, turn_stddev_deg: float | None = None
+) -> NightAnswers:
+    """Answer pointings, some of which have a roll; turn_stddev_deg: as of `How`."""
+    if turn_stddev_deg is None:
+        each = (FrameAnswer(p.source, solver.solve_pointing(p, tilts)) for p in pointings)
+        return NightAnswers(each=each, given=solver.instrument)
+    found, said = turned(solver, [p for p in pointings if p.has_roll], tilts, turn_stddev_deg)
+    following = iter(found.solutions)
+    solutions = (next(following) if p.has_roll else solver.solve_pointing(p) for p in pointings)
+    each = (FrameAnswer(p.source, s) for p, s in zip(pointings, solutions, strict=True))
+    return NightAnswers(each=each, turned=found, remarks=said)
 
 
 def _one_by_one(sights: Iterable[tuple[str, Sight | FrameError]], asked: Solving) -> Iterator[FrameAnswer]:
@@ -232,21 +278,18 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
     """The night of these exposures; raises InstrumentError if there is no instrument for a frame."""
     work = replace(exposures.work, progress=progress)
     answers = answers_of(exposures.each(how.work(work)), work, exposures.vertical, how, progress)
-    shots, of_frames, gathered = [], [], Gathered()
-    for done, answer in enumerate(answers.each, 1):
-        gathered.gather(answer)
+    shots, of_frames = [], []
+    for done, answer in enumerate(answers, 1):
         shots.append(Shot.of(answer.name, answer.solution, answer.stars))
         of_frames.append(answer.solution.remark)
         progress(exposures.name[:20], done / exposures.count)
-    whole = together(gathered, answers.given)
-    if gathered.lost is not None and not gathered.solved:
-        of_frames.append(work.fitting(gathered.lost))
+    whole = answers.together()
     return Night(
         name=exposures.name,
         origin=exposures.origin,
         shots=shots,
         combined=whole.average,
-        why_not=whole.why_not if gathered.solved or gathered.circles else why_none(shots),
+        why_not=whole.why_not or ("" if whole.average else why_none(shots)),
         vertical=exposures.vertical,
         atmosphere=exposures.work.atmosphere,
         truth=exposures.truth,

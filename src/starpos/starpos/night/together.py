@@ -4,7 +4,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,12 +12,15 @@ import numpy as np
 from starpos.averaging.altitudes import MIN_JUDGED, Directions, place_of_circles, place_of_discs
 from starpos.averaging.average import Average, average
 from starpos.averaging.elevation_axis import MIN_WITHOUT_SITE, FoundAxis, find_axis
+from starpos.averaging.poses import MeanAttitude
+from starpos.averaging.sights import SextantSight, circle_of_sight, place_of_sights
 from starpos.calibration.misalignment import Calibrated, turn
 from starpos.earth.place import Place
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, FrameError, StarposError
 from starpos.fix.checks import unknown_a3, unnamed_inclinometer
 from starpos.fix.circle import Circle, circle_of
-from starpos.fix.fix import IDEAL, Fix
+from starpos.fix.fix import IDEAL, Fix, PlaceFix
 from starpos.fix.searching import Sight
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
@@ -27,6 +30,8 @@ from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
 from starpos.night.remarks import Near, doubts
+from starpos.sky.bodies import ERFA, SolarSystem
+from starpos.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:
     from starpos.gnss.solving import Watched
@@ -103,23 +108,31 @@ class Gathered:
         return [s.fix for s in self.solved if s.fix is not None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Together:
     """The average of a night's fixes, None if it is missing, as why_not says; and remarks on it.
 
     axis: A3's, which elevations determined too; None if A3 was known well enough or they do not determine it.
+    mean: attitude at a known place; None without one.  gathered: of the answers; nothing of elevations alone.
     """
 
     average: Average | None = None
     why_not: str = ""
     remarks: tuple[str, ...] = ()
     axis: FoundAxis | None = None
+    mean: MeanAttitude | None = None
+    gathered: Gathered = field(default_factory=Gathered)
+
+    @property
+    def where(self) -> PlaceFix | None:
+        """The average, or else the last fix; None without any."""
+        return self.average or next(reversed(self.gathered.fixes), None)
 
     @classmethod
     def by_circles(cls, place: Average, near: Near | None) -> "Together":
         """The place where circles meet, and what looks wrong with it."""
         said = *remarks.of_average(place), *doubts((), place, None, near)
-        return cls(place, "", tuple(filter(None, said)))
+        return cls(average=place, remarks=tuple(filter(None, said)))
 
 
 def together(gathered: Gathered, given: Instrument | None, near: Near | None = None) -> Together:
@@ -148,7 +161,7 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
         said += [remarks.of_copies(fixes)] if given.has_level_inside else []
     said += [] if gathered.mark is None else [remarks.of_mark(place, gathered.mark)]
     said += doubts(fixes, place, a3, near or gathered.site)
-    return Together(whole, why_not, tuple(filter(None, said)))
+    return Together(average=whole, why_not=why_not, remarks=tuple(filter(None, said)))
 
 
 def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
@@ -161,7 +174,7 @@ def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
             )
         place, _ = place_of_discs(circles, None if near is None else near.place)
     except FixError as error:
-        return Together(None, str(error))
+        return Together(why_not=str(error))
     return Together.by_circles(place, near)
 
 
@@ -227,9 +240,9 @@ def from_elevations(
             unnamed_inclinometer(solver.instrument),
             *doubts((), place, None, near),
         )
-        whole = Together(place, "", tuple(filter(None, said)), axis)
+        whole = Together(average=place, remarks=tuple(filter(None, said)), axis=axis)
     except FixError as error:
-        whole = Together(None, str(error), axis=axis)
+        whole = Together(why_not=str(error), axis=axis)
     if self_calibrate or axis is not None or not remarks.beyond_stated(whole.average):
         return circles, whole
     # residuals beyond the stated errors may come from a wrong A3, which no scatter covers
@@ -238,6 +251,31 @@ def from_elevations(
     if free.axis is None or free.axis.directions < MIN_JUDGED or free.axis.sigma_from(given) < DENIED_SIGMA:
         return circles, whole
     return circles, replace(free, remarks=(remarks.of_denied_a3(free.axis, given), *free.remarks))
+
+
+def from_sights(
+    sights: Sequence[SextantSight],
+    atmosphere: Atmosphere,
+    clock_stddev_s: float,
+    near: Near | None = None,
+    ephemeris: SolarSystem = ERFA,
+) -> tuple[list[Circle | StarposError], Together]:
+    """Each sight's circle, or the error, and their place; near: selects between two places that two sights leave."""
+    circles: list[Circle | StarposError] = []
+    for sight in sights:
+        try:
+            circles.append(circle_of_sight(sight, load_catalogue(), atmosphere, clock_stddev_s, ephemeris))
+        except StarposError as error:
+            circles.append(error)
+    sound = [(s, c) for s, c in zip(sights, circles, strict=True) if isinstance(c, Circle)]
+    if not sound:
+        return circles, Together()
+    try:
+        used, seen = zip(*sound, strict=True)
+        place = place_of_sights(used, seen, None if near is None else near.place)
+    except StarposError as error:
+        return circles, Together(why_not=str(error))
+    return circles, Together.by_circles(place, near)
 
 
 def axis_of(

@@ -2,7 +2,7 @@
 """A voyage from its frames and an IMU: frames are read and identified, then placed under way."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,10 +20,9 @@ from starpos.navigation.records import ImuModel, read_imu, read_imu_model, read_
 from starpos.navigation.sightings import PlacelessFrame, sighting_of
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, adjust_voyage
-from starpos.night.reading import Instruments, Reader
-from starpos.night.work import Solving
-from starpos.parallel.processes import in_turn
-from starpos.progress import Progress, quiet
+from starpos.night.reading import Each, Instruments, Reader
+from starpos.night.work import Solving, prepare
+from starpos.progress import Progress, Say, quiet
 from starpos.sky import catalogue
 
 MOUNT, MOUNT_STDDEV_DEG, MAX_MOUNT_DEG = "the mount", 1.0, 20.0
@@ -86,22 +85,46 @@ def vessel_of(
     return vessel
 
 
+def first_of(read: Reader, paths: Sequence[str]) -> Stars:
+    """The first frame of a voyage; VoyageError if none can be read."""
+    about = read.first(paths)
+    if about is None:
+        raise VoyageError(f"none of the {len(paths)} frames can be read: give star lists or frames")
+    return about
+
+
 def voyage_of(
-    frames: Sequence[VoyageFrame], imu: str, velocity: str | None, vessel: Vessel, progress: Progress = quiet
-) -> Voyage:
-    """The places of the frames, by tables of an IMU and of velocities along the body's axes, if there are any.
+    about: Stars,
+    each: Each,
+    given: Instruments,
+    imu: str | Path,
+    velocity: str | Path | None,
+    atmosphere: Atmosphere,
+    say: Say = quiet,
+    progress: Progress = quiet,
+    **assumed: Any,
+) -> tuple[list[VoyageFrame], Voyage]:
+    """The frames, and their places by tables of an IMU and of velocities along the body's axes, if there are any.
+
+    about: the first of the frames, through which `each` goes.  say: takes what looks wrong.  assumed: for `vessel_of`.
 
     VoyageError for broken records, FixError where the stars do not support a place.
     """
+    assert given.instrument is not None
+    whole, doubt = framed(given.instrument, about, MOUNT)
+    vessel = vessel_of(whole, atmosphere, doubt, **assumed)
+    given = replace(given, instrument=whole)
+    say(doubt, prepare(given, about, progress))
+    # a frame that cannot be read has only its sentence
+    frames = [
+        VoyageFrame(None, None, str(answer)) if isinstance(answer, FrameError) else answer
+        for _, answer in each(partial(voyage_frame, given))
+    ]
+    say(*(frame.message for frame in frames))
     measured = None if velocity is None else read_velocity(velocity)
     times = np.array([np.nan if f.utc_unix_s is None else f.utc_unix_s for f in frames])
     sightings = [f.sighting for f in frames if f.sighting is not None]
-    return adjust_voyage(sightings, read_imu(imu), measured, vessel, times, progress)
-
-
-def voyage_frames(answers: Iterable[VoyageFrame | FrameError]) -> list[VoyageFrame]:
-    """The answers of `voyage_frame`; a frame that cannot be read has only its sentence."""
-    return [VoyageFrame(None, None, str(a)) if isinstance(a, FrameError) else a for a in answers]
+    return frames, adjust_voyage(sightings, read_imu(imu), measured, vessel, times, progress)
 
 
 def navigate(
@@ -148,12 +171,8 @@ def navigate(
     """
     paths, read = tuple(map(str, frames)), Reader()
     known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
-    about = read.first(paths)
-    if about is None:
-        raise VoyageError(f"none of the {len(paths)} frames can be read: give star lists or frames")
-    whole, doubt = framed(known, about, MOUNT)
-    air = Atmosphere.measured(None, None) if atmosphere is None else atmosphere
-    vessel = vessel_of(whole, air, doubt, **assumed)
-    work = partial(read.on, partial(voyage_frame, Instruments(whole)))
-    placed = voyage_frames(in_turn((work, path) for path in paths))
-    return voyage_of(placed, str(imu), None if velocity is None else str(velocity), vessel, progress)
+    about, air = first_of(read, paths), atmosphere or Atmosphere.measured(None, None)
+    _, voyage = voyage_of(
+        about, read.each(paths), Instruments(known), imu, velocity, air, progress=progress, **assumed
+    )
+    return voyage

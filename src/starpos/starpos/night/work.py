@@ -29,7 +29,6 @@ from starpos.sky.bodies import ERFA, SolarSystem
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
-    from starpos.satellites.trails import SatelliteTrail
 
 # Share by which a photograph's focal length may differ from its EXIF's, rounded to 1 mm of a 35 mm film's: 4 % of 13 mm.
 CUT_OUT = 0.06
@@ -249,22 +248,14 @@ def identify(
     return Solving(given, search_s=search_s, progress=progress)(item).solution
 
 
-def trails_seen(
-    solving: Solving, item: Frame | Stars
-) -> "tuple[searching.Sight, list[SatelliteTrail], str] | Solution":
-    """A frame that is identified by every way there is, its satellites' trails, and a sentence on those left out.
-
-    A frame's fault is a Solution that gives the reason; FrameError for a list of stars.
-    """
-    from starpos.satellites.frames import trails_of
-
-    if isinstance(item, Stars):
-        raise FrameError(f"{item.place}: a list of stars shows no trails: give the frame")
-    sight = solving(item)
-    known = sight.instrument or solving.instruments.of(item)
-    stars = sight.stars if known is None else replace(sight.stars, shutter=known.shutter or item.shutter)
-    try:
-        found, left_out = trails_of(item, stars, sight.solution, catalogue.load_catalogue())
-        return replace(sight, stars=stars, instrument=known), found, left_out
-    except StarposError as error:
-        return Solution.refused(stars, error)
+def prepare(given: Instruments, about: Stars, progress: Progress = quiet) -> str:
+    """Put the tables of a field, or of any, into the cache, for all processes; a sentence on what the catalogue lacks."""
+    stars = catalogue.load_catalogue()
+    if given.instrument is None or given.sought:
+        BlindSolver(stars, progress).prepare()
+        return ""
+    # the frames report the error
+    with suppress(StarposError):
+        solver = Solver(given.instrument, stars, progress=progress)
+        return solver.prepare(about.width, about.height, about.origin_px)
+    return ""

@@ -32,9 +32,22 @@ FLOOR_M = 2.0
 class SatelliteFix:
     """A place from satellites.
 
-    latitude, longitude (rad), height_m: on WGS 84.  covariance (3, 3): east, north, up, m2.
-    named: for each trail its orbit, or None.  adjusted: row of each trail in the adjustment, or -1.
-    satellites: number of different ones that the place stands on.
+    Attributes
+    ----------
+    latitude, longitude, height_m : rad, rad, m, on WGS 84
+    covariance : (3, 3) east, north, up, m2
+    clock_s, clock_stddev_s : s, to be added to the stamps, and its error
+    named : for each trail its orbit, or None
+    adjusted : row of each trail in the adjustment, or -1
+    satellites : number of different ones that the place stands on
+    adjustment : of the trails
+    headings : names of frames, and their cameras' headings there with the errors, rad
+
+    Examples
+    --------
+    >>> fix = starpos.locate(["sightings.csv"], ["active.tle"], height_m=900)
+    >>> fix.satellites, fix.covariance.shape
+    (8, (3, 3))
     """
 
     latitude: float
@@ -47,6 +60,7 @@ class SatelliteFix:
     adjusted: np.ndarray
     satellites: int
     adjustment: PlaceAdjustment
+    headings: tuple[tuple[str, float, float], ...] = ()
 
     @property
     def text(self) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from starpos.averaging.average import Average
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import StarposError
+from starpos.fix.checks import BY_PARAMETERS, MODEL_BY_PARAMETERS, unknown_a3, unnamed_inclinometer
 from starpos.fix.solution import Solution
 from starpos.frames.frame import Stars
 from starpos.frames.reading import read_frame
@@ -23,6 +24,8 @@ from starpos.messages.tilt import Reading
 from starpos.night.field import INSTRUMENT, is_field, opened
 from starpos.night.opening import frames_in
 from starpos.night.reading import stars_of
+from starpos.night.remarks import of_extrapolation
+from starpos.night.together import FrameAnswer, Gathered, Together
 from starpos.recording import topics
 from starpos.recording.bag import BagReader
 from starpos.recording.drivers import DriverMessages, Drivers
@@ -171,6 +174,20 @@ class PlayedNight:
         """Numbers of frames, answers and fixes."""
         fixes = sum(s.fix is not None for s in self.solutions)
         return f"{self.frames} frames, {len(self.solutions)} answers, {fixes} fixes"
+
+    @property
+    def together(self) -> Together:
+        """The average, and what looks wrong with it, as parameters cure it."""
+        gathered, whole, said = Gathered(), self.average, list[str]()
+        for solution in self.solutions:
+            gathered.gather(FrameAnswer("", solution))
+        if gathered.solved:
+            said.append(of_extrapolation(gathered.solved))
+            said.append(unnamed_inclinometer(self.instrument, MODEL_BY_PARAMETERS))
+        if whole:
+            a3 = self.instrument.calibration
+            said.append(unknown_a3(a3, whole.covariance, whole.terms, BY_PARAMETERS))
+        return Together(average=whole, remarks=tuple(filter(None, said)), gathered=gathered)
 
 
 class _Said:

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import skies
 
 from starpos.earth.gravity import itrs_place
 from starpos.earth.place import Place
@@ -16,6 +15,7 @@ from starpos.satellites.elements import chosen, read_orbits
 from starpos.satellites.locating import locate
 from starpos.satellites.sightings import read_sightings
 from starpos.satellites.trails import turned
+from starpos_testing.skies import sightings as skies
 
 PLACE = 47.0, 8.0, 900.0
 PRIOR = KnownBefore(900.0, 20.0, 0.002)

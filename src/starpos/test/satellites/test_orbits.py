@@ -4,7 +4,6 @@
 import erfa
 import numpy as np
 import pytest
-import skies
 from astropy.coordinates import GCRS, TEME, CartesianRepresentation
 from astropy.time import Time
 
@@ -12,6 +11,7 @@ from starpos.earth.gravity import itrs_place
 from starpos.earth.orientation import earth_state
 from starpos.satellites.elements import Ephemeris, read_orbits, teme_to_gcrs
 from starpos.satellites.orbits import Moments, observed, raised, states
+from starpos_testing.skies import sightings as skies
 
 PLACE = 40.0, 10.0, 1500.0
 

@@ -8,15 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import skies
 from astropy import units as u
 from astropy.coordinates import AltAz, EarthLocation, get_sun
 from astropy.time import Time
 
+import starpos
 from starpos.cli import main
+from starpos.errors import SatelliteError
 from starpos.simulation.scene import expose, render, scene_of, write_fits
 from starpos.sky.catalogue import load_catalogue
 from starpos.units import unix_of
+from starpos_testing.skies import sightings as skies
 
 PLACE = 47.0, 8.0, 900.0
 
@@ -97,6 +99,11 @@ def test_a_frame_has_its_heading_at_that_place(night, tmp_path, capsys):
     (frame,) = place["frames"]
     off = (frame["heading"] - np.degrees(scene.heading) + 180) % 360 - 180
     assert abs(off) < 4 * frame["sigma_heading_deg"] < 0.02
+    seen = folder / "all.csv", tmp_path / "a.fits"
+    fix = starpos.locate(seen, [folder / "active.tle"], instrument=starpos.Instrument(7812.5), height_m=900)
+    assert np.degrees(fix.headings[0][1]) == pytest.approx(frame["heading"], abs=1e-9)
+    with pytest.raises(SatelliteError, match=r"none of 1 frames shows an end of a trail"):
+        starpos.locate(seen[1:], [folder / "active.tle"])
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@
 from functools import cache
 
 import numpy as np
-from astropy import units as u
+from astropy import units
 from astropy.coordinates import (
     GCRS,
     TEME,
@@ -30,11 +30,11 @@ def drawn(count: int, seed: int, names: str = "OBJECT"):
 def surroundings(latitude_deg: float, longitude_deg: float, height_m: float, utc_unix_s: float):
     """TEME into GCRS (3, 3), the observer (3,) km, and the Earth's velocity (3,) km/s, by astropy."""
     t = Time(utc_unix_s, format="unix", scale="utc")
-    axes = TEME(CartesianRepresentation(np.eye(3) * u.km), obstime=t).transform_to(GCRS(obstime=t))
+    axes = TEME(CartesianRepresentation(np.eye(3) * units.km), obstime=t).transform_to(GCRS(obstime=t))
     place = EarthLocation.from_geodetic(longitude_deg, latitude_deg, height_m)
-    site = place.get_gcrs_posvel(t)[0].xyz.to_value(u.km)
-    earth = get_body_barycentric_posvel("earth", t)[1].xyz.to_value(u.km / u.s)
-    return axes.cartesian.xyz.to_value(u.km), site, earth
+    site = place.get_gcrs_posvel(t)[0].xyz.to_value(units.km)
+    earth = get_body_barycentric_posvel("earth", t)[1].xyz.to_value(units.km / units.s)
+    return axes.cartesian.xyz.to_value(units.km), site, earth
 
 
 def sight(record, place: tuple[float, float, float], utc_unix_s: float, ahead_s: float = 0.0):
@@ -44,7 +44,7 @@ def sight(record, place: tuple[float, float, float], utc_unix_s: float, ahead_s:
     """
     axes, site, earth = surroundings(*place, utc_unix_s)
 
-    def at(seconds: float) -> np.ndarray:
+    def at(seconds) -> np.ndarray:
         moment = Time(utc_unix_s + seconds, format="unix", scale="utc")
         return axes @ np.array(record.sgp4(moment.jd1, moment.jd2)[1])
 
@@ -67,7 +67,7 @@ def table(records, place, rng, *, count: int, late_s: float = 0.0, along_s=None,
 
     late_s: UTC minus the stamp.  along_s (N,): by how much each satellite is before its elements.
     """
-    rows, numbers = ["track,utc,ra_deg,dec_deg,stddev_arcsec"], []
+    rows, numbers = ["track,utc,ra_deg,dec_deg,stddev_arcsec"], list[int]()
     at = NIGHT
     for k, record in enumerate(records):
         ahead = 0.0 if along_s is None else along_s[k]
