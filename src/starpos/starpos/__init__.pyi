@@ -37,6 +37,7 @@ from starpos.night.night import Night as Night
 from starpos.night.night import Shot as Shot
 from starpos.night.opening import NightOnDisk as NightOnDisk
 from starpos.night.opening import open_night as open_night
+from starpos.night.together import sights as sights
 from starpos.night.under_way import navigate as navigate
 from starpos.night.work import identify as identify
 from starpos.satellites.locating import SatelliteFix as SatelliteFix

@@ -110,6 +110,8 @@ def workplace(tmp_path_factory, catalogue):
     (folder / "active.tle").write_text(elements)
     trails, _ = sightings.table(satellites, (47.0, 8.0, 900.0), np.random.default_rng(5), count=8)
     (folder / "sightings.csv").write_text(trails)
+    chicago = "sun,2024-05-05T15:55:18,55.13364\nsun,2024-05-05T23:01:19,19.47194\nvega,2024-05-06T04:04:13,30.27325\n"
+    (folder / "sights.csv").write_text(f"body,utc,altitude_deg\n{chicago}")
     rows = "".join(f"{1.8e9 + k},35.7046,51.4106,2.0,2.0\n" for k in range(3))
     (folder / "gnss.csv").write_text("utc_unix_s,latitude,longitude,sigma_east_m,sigma_north_m\n" + rows)
     return folder

@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ from starpos.averaging.altitudes import MIN_JUDGED, Directions, place_of_circles
 from starpos.averaging.average import Average, average
 from starpos.averaging.elevation_axis import MIN_WITHOUT_SITE, FoundAxis, find_axis
 from starpos.averaging.poses import MeanAttitude
-from starpos.averaging.sights import SextantSight, circle_of_sight, place_of_sights
+from starpos.averaging.sights import SextantSight, circle_of_sight, place_of_sights, read_sights
 from starpos.calibration.misalignment import Calibrated, turn
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
@@ -26,7 +27,7 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
-from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.instrument import UNKNOWN_CLOCK_S, Calibration, Instrument
 from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
 from starpos.night.remarks import Near, doubts
@@ -276,6 +277,49 @@ def from_sights(
     except StarposError as error:
         return circles, Together(why_not=str(error))
     return circles, Together.by_circles(place, near)
+
+
+def sights(
+    path: str | Path,
+    *,
+    atmosphere: Atmosphere | None = None,
+    clock_stddev_s: float = UNKNOWN_CLOCK_S,
+    near: tuple[float, float] | None = None,
+) -> Average:
+    """The place by altitudes that were measured by hand, as with a sextant.
+
+    Parameters
+    ----------
+    path : of the CSV: body, utc, altitude_deg, and what was read off the instrument
+    atmosphere : of refraction; None: not measured
+    clock_stddev_s : error of the clock, s
+    near : latitude, longitude in deg, of which two places that two sights leave the nearer one is taken
+
+    Returns
+    -------
+    Average
+        astronomic latitude and longitude in rad, with their covariance; where the last sight was taken
+
+    Raises
+    ------
+    FixError
+        the sights do not give a place
+    FrameError
+        the table cannot be used
+
+    Examples
+    --------
+    >>> air = starpos.Atmosphere(pressure_pa=101_000.0, temperature_c=10.0)
+    >>> place = starpos.sights("sights.csv", atmosphere=air, clock_stddev_s=1.0)
+    >>> np.degrees([place.latitude, place.longitude]).round(1)
+    array([ 41.9, -87.6])
+    """
+    air = Atmosphere.measured(None, None) if atmosphere is None else atmosphere
+    around = None if near is None else Near(*np.radians(near).tolist())
+    circles, whole = from_sights(read_sights(path), air, clock_stddev_s, around)
+    if whole.average is None:
+        raise FixError(whole.why_not or str(circles[0]))
+    return whole.average
 
 
 def axis_of(
