@@ -8,10 +8,17 @@ import threading
 import pytest
 
 from starpos_inclinometer.sources import serial_link
-from starpos_inclinometer.sources.source import Phase
+from starpos_inclinometer.sources.source import Phase, rate_of
 from starpos_testing.emulator import Mcu
 
 NOBODY = 65534
+
+
+@pytest.mark.parametrize(
+    ("times_s", "rate_hz"), [([], 0.0), ([7.0], 0.0), ([7.0, 7.0, 7.0], 0.0), ([0.0, 6.0, 6.5, 7.0], 2.0)]
+)
+def test_a_rate_is_of_the_last_seconds_and_no_time_is_no_rate(times_s, rate_hz):
+    assert rate_of(times_s, 7.0) == rate_hz
 
 
 def test_samples_identity_and_rate(bench, read):
