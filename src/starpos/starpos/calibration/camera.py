@@ -115,10 +115,8 @@ class Intrinsics:
     @property
     def _grid(self) -> np.ndarray:
         """Pixels (G, 2) all over the frame; of a fisheye where it has shown stars."""
-        grid, middle = (
-            pixels_over(self.camera.width, self.camera.height, BORDER),
-            [self.camera.cx, self.camera.cy],
-        )
+        grid = pixels_over(self.camera.width, self.camera.height, BORDER)
+        middle = [self.camera.cx, self.camera.cy]
         if self.camera.model != EQUIDISTANT:
             return grid
         return grid[np.hypot(*(grid - middle).T) <= np.hypot(*(self.xy - middle).T).max()]

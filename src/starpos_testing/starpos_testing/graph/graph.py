@@ -145,10 +145,10 @@ class Graph:
         """Take a message, if one comes within a time in s."""
         self._executor.spin_once(timeout_sec=seconds)
 
-    def wait(self, condition, why="") -> None:
-        if not self.comes(condition, WAIT_S):
+    def wait(self, condition, why="", seconds=WAIT_S) -> None:
+        if not self.comes(condition, seconds):
             tails = "\n".join(f"{p.name}: {p.output[-2000:]}" for p in self.processes)
-            raise AssertionError(f"waited {WAIT_S:g} s in vain {why}\n{tails}")
+            raise AssertionError(f"waited in vain {why}\n{tails}")
 
     def wait_for_solver(self):
         """Wait until the solver hears our publishers and we hear its; call it before a detector is there."""
@@ -222,7 +222,9 @@ class Graph:
         def found():
             return [s for _, s in self.diagnostics.get(name, ()) if text in s.message]
 
-        self.wait(found, f"for {name} to say {text!r}; it said {self.diagnostics.get(name, [])[-1:]}")
+        if not self.comes(found, WAIT_S):
+            said = [s.message for _, s in self.diagnostics.get(name, ())][-1:]
+            self.wait(found, f"for {name} to say {text!r}; it said {said}", 0.0)
         return found()[-1]
 
     def call(self, kind, name, request):
