@@ -369,6 +369,10 @@ class Calibrating:
         self._worker.run(job, lambda outcome: self._turned_by_itself(outcome, era))
 
     def _turned_by_itself(self, outcome: Outcome, era: int) -> None:
+        if not self._values["self_calibration"]:
+            # switched off while it worked
+            self._again = False
+            return
         if era == self._era:
             said = outcome.trouble or self._why_not(outcome.value, MIN_BY_ITSELF)
             if not said and not self._is_better(outcome.value.calibrated):
